@@ -37,7 +37,6 @@ import mujoco
 import numpy as np
 import torch
 import tyro
-from torch._inductor import config as inductor_config
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 from tqdm import tqdm
@@ -156,7 +155,7 @@ FREE_ON_RESUME = {"resume", "run_dir", "progress", "track", "capture_video", "ch
 
 def refuse(sentence: str):
     """End the program with one sentence about its input."""
-    print(f"{SCRIPT}: error: {sentence}", file=sys.stderr)
+    print(f"{Path(sys.argv[0]).name}: error: {sentence}", file=sys.stderr)
     raise SystemExit(EXIT_BAD_ARGUMENTS)
 
 
@@ -251,6 +250,13 @@ class Environments:
         self.actions[i], self.returns[i] = [], 0.0
         return self.envs[i].reset(seed=seed)[0]
 
+    def step_one(self, i: int, action: np.ndarray) -> tuple:
+        """Step environment i and record what its replay and its return need."""
+        obs, reward, terminated, truncated, _ = self.envs[i].step(action)
+        self.actions[i].append(action)
+        self.returns[i] += float(reward)
+        return obs, reward, terminated, truncated
+
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, list, list, list, dict]:
         """Step every environment with its row of (N, action_dim).
 
@@ -258,10 +264,8 @@ class Environments:
         the episodes that ended; their obs is the first of the next episode.
         """
         rewards, terminated, truncated, ended = [], [], [], {}
-        for i, env in enumerate(self.envs):
-            obs, reward, terminal, timeout, _ = env.step(actions[i])
-            self.actions[i].append(actions[i])
-            self.returns[i] += float(reward)
+        for i, action in enumerate(actions):
+            obs, reward, terminal, timeout = self.step_one(i, action)
             if terminal or timeout:
                 ended[i] = obs, self.returns[i], len(self.actions[i])
                 obs = self.reset(i)
@@ -281,9 +285,7 @@ class Environments:
             self.episodes[i] = state["episodes"][i] - 1
             self.obs[i] = self.reset(i)
             for action in actions.numpy():
-                self.obs[i], reward, *_ = self.envs[i].step(action)
-                self.actions[i].append(action)
-                self.returns[i] += float(reward)
+                self.obs[i], *_ = self.step_one(i, action)
 
 
 # --- Normaliser -------------------------------------------------------------------------------------------------------
@@ -608,7 +610,6 @@ def compile_update(agent: Agent, moments) -> tuple:
     batch = [torch.zeros(args.batch_size, *shape, device=agent.device)
              for shape in ((obs_dim,), (action_dim,), (), (), (), ())]  # fmt: skip
     index = torch.arange(args.batch_size // args.num_minibatches, device=agent.device)
-    inductor_config.compile_threads = args.num_threads
     if args.cuda:
         options = {"triton.cudagraphs": True}
     else:  # C++ calls the kernels; tanh from exp; and on small matrices a bias in the next kernel is faster than addmm
@@ -684,7 +685,8 @@ def evaluate_checkpoint(path: Path, given: Args):
     returns, lengths = evaluate(agent, seeds, "human" if args.render else "rgb_array" if videos else None, videos)
     for i, (episode_return, length) in enumerate(zip(returns, lengths), start=1):
         print(f"episode {i}: return {episode_return:.3f}, length {length}")
-    print("step {:,}: mean return {:.3f}, std {:.3f} (ddof 1)".format(checkpoint["global_step"], *mean_and_std(returns)))
+    mean, std = mean_and_std(returns)
+    print(f"step {checkpoint['global_step']:,}: mean return {mean:.3f}, std {std:.3f} (ddof 1)")
     if videos:
         print(f"videos are in {videos}")
 
@@ -752,13 +754,13 @@ def open_run(args: Args) -> tuple[Path, dict | None]:
                 refuse(f"the run in {run_dir} has lost its config.json, so that it cannot be continued")
             write_atomically(run_dir / "config.json", json.dumps(config, indent=2).encode())
         old = json.loads((run_dir / "config.json").read_text())
-        changed = {k: old["args"][k] for k, v in config["args"].items() if k not in FREE_ON_RESUME and old["args"][k] != v}
+        changed = [k for k, v in config["args"].items() if k not in FREE_ON_RESUME and old["args"][k] != v]
     except OSError as error:
         refuse(f"cannot write to the run folder {run_dir}: {error.strerror}")
     except (ValueError, KeyError, TypeError):
         refuse(f"{run_dir / 'config.json'} is damaged or not of this {SCRIPT}")
     if changed:
-        was = ", ".join(f"--{name.replace('_', '-')} {value}" for name, value in changed.items())
+        was = ", ".join(f"--{name.replace('_', '-')} {old['args'][name]}" for name in changed)
         refuse(f"the run in {run_dir} was started with other flags than these: {was}")
     if (run_dir / "result.json").exists():
         print(f"the run in {run_dir} is finished")
@@ -774,6 +776,7 @@ def open_run(args: Args) -> tuple[Path, dict | None]:
 
 def fail_numerically(run_dir: Path, **facts):
     """End the run where a number is not finite: say which, where and when; the last checkpoint is left as it is."""
+    facts["mujoco_warnings"] = mujoco_warnings[:5]
     write_atomically(run_dir / "failure.json", json.dumps(facts, indent=2).encode())
     print(f"{SCRIPT}: numerical failure: {facts} (also in {run_dir / 'failure.json'})", file=sys.stderr)
     raise SystemExit(EXIT_FAILURE)
@@ -783,10 +786,11 @@ def check_rollout(run_dir: Path, roll: Rollout, step: int):
     """Fail at the first reward or observation that is not finite."""
     bad = ~np.isfinite(roll.rewards) | ~np.isfinite(roll.obs[1:]).all(-1)
     if bad.any():
-        t, i = map(int, np.argwhere(bad)[0])
+        t, i = np.argwhere(bad)[0].tolist()
         values = {"reward": roll.rewards[t, i], "action": roll.actions[t, i], "next_obs": roll.obs[t + 1, i]}
-        fail_numerically(run_dir, what="a reward or an observation is not finite", global_step=step + (t + 1) * len(bad[t]),
-                         env=i, mujoco=mujoco_warnings[:5], **{k: str(v.tolist()) for k, v in values.items()})  # fmt: skip
+        values = {name: str(value.tolist()) for name, value in values.items()}  # JSON has no NaN
+        step += (t + 1) * bad.shape[1]
+        fail_numerically(run_dir, what="a reward or an observation", global_step=step, env=i, **values)
 
 
 # --- Main -------------------------------------------------------------------------------------------------------------
@@ -829,17 +833,17 @@ def main():
         rng.bit_generator.state = saved["rng"]
         progress = saved["progress"]
     obs = agent.normalizer.normalize(envs.obs) if saved else agent.normalizer.observe(envs.obs)
-    step = progress["global_step"]
+    step, last_step = progress["global_step"], args.num_iterations * args.batch_size
 
     def checkpoint(name: str, **more):
         save_checkpoint(run_dir / name, {"args": asdict(args), "global_step": step, **agent.tensors(), **more})
 
     # Logs; a resumed run drops what followed its checkpoint, since it will log that again
     evaluations = run_dir / "evaluations.csv"
-    rows = evaluations.read_text().splitlines()[1:] if saved else []
-    rows = [row for row in rows if int(row.split(",")[0]) <= step]
-    header = "global_step,return_mean,return_std,return_min,return_max,length_mean"
-    write_atomically(evaluations, "".join(f"{row}\n" for row in [header, *rows]).encode())
+    rows = evaluations.read_text().splitlines(keepends=True)[1:] if saved else []
+    rows = [row for row in rows if row.endswith("\n") and int(row.split(",")[0]) <= step]
+    header = "global_step,return_mean,return_std,return_min,return_max,length_mean\n"
+    write_atomically(evaluations, "".join([header, *rows]).encode())
     if args.track:
         import_module("wandb").init(project=args.wandb_project_name, entity=args.wandb_entity, name=run_dir.name,
                                     dir=run_dir, config=asdict(args), sync_tensorboard=True)  # fmt: skip
@@ -852,43 +856,48 @@ def main():
     if saved and saved["compiled"] != compiled:
         refuse(f"the run in {run_dir} was {'' if saved['compiled'] else 'not '}compiled, and continues exactly only so")
 
-    bar = tqdm(total=args.num_iterations * args.batch_size, initial=step, unit=" steps", unit_scale=True,
-               disable=None if args.progress else True, smoothing=0.05)  # fmt: skip
+    bar = tqdm(total=last_step, initial=step, unit=" steps", unit_scale=True, smoothing=0.05,
+               disable=None if args.progress else True)  # fmt: skip
     last_return = last_eval = "-"
-    while step < args.num_iterations * args.batch_size:
+    while step < last_step:
+        # Rollout
         start, step_before = time.time(), step
-        remaining = 1 - step / (args.num_iterations * args.batch_size) if args.anneal_lr else 1.0
         mujoco_warnings.clear()
         roll = collect(agent, envs, obs, args.num_steps, rng)
         check_rollout(run_dir, roll, step)
         obs = roll.obs[-1]
+
+        # Update
         batch, explained_variance = prepare_batch(agent, roll)
-        learning_rate = args.learning_rate * remaining
+        learning_rate = args.learning_rate * (1 - step / last_step if args.anneal_lr else 1)
         losses, updates = learn(update_function, agent, moments, batch, rng, learning_rate, progress["adam_steps"])
         progress["adam_steps"] += updates
         step = progress["global_step"] = step + args.batch_size
-
         scalars = {f"losses/{name}": value for name, value in zip(LOSSES, losses)}
         if not np.isfinite(losses).all() or not all(p.isfinite().all() for p in agent.params.values()):
             values = {name: str(value) for name, value in scalars.items()}
-            fail_numerically(run_dir, what="a loss, the gradient or a parameter is not finite", global_step=step, **values)
+            fail_numerically(run_dir, what="a loss, the gradient or a parameter", global_step=step, **values)
+
+        # Logs
+        scalars |= {"losses/explained_variance": explained_variance, "charts/learning_rate": learning_rate,
+                    "charts/mujoco_warnings": len(mujoco_warnings)}  # fmt: skip
         for offset, episode_return, length in roll.episodes:
             writer.add_scalar("charts/episodic_return", episode_return, step_before + offset)
             writer.add_scalar("charts/episodic_length", length, step_before + offset)
             last_return = f"{episode_return:.1f}"
             if step_before + offset > 0.9 * args.total_timesteps:
                 progress["late_returns"].append(episode_return)
-        scalars |= {"losses/explained_variance": explained_variance, "charts/learning_rate": learning_rate,
-                    "charts/mujoco_warnings": len(mujoco_warnings)}  # fmt: skip
         progress["train_seconds"] += time.time() - start
         scalars["charts/SPS"] = step / progress["train_seconds"]
 
         def due(interval: int | None, step=step, step_before=step_before) -> bool:
             return interval is not None and step // interval > step_before // interval
 
-        finished = step == args.num_iterations * args.batch_size
-        if due(args.eval_interval) or finished:
+        # Evaluation
+        if due(args.eval_interval) or step == last_step:
             returns, lengths = evaluate(agent, evaluation_seeds(args, step))
+            if not np.isfinite(returns).all():
+                fail_numerically(run_dir, what="an evaluation return", global_step=step, returns=str(returns.tolist()))
             mean, std = mean_and_std(returns)
             scalars |= {"eval/return_mean": mean, "eval/return_std": std, "eval/episode_length": lengths.mean()}
             with evaluations.open("a") as file:
@@ -898,13 +907,15 @@ def main():
                 checkpoint("best.pt", selection_return=mean)
             last_eval = f"{mean:.1f}"
             if args.progress:
-                bar.write(f"step {step:,}: evaluation return {mean:.1f} +- {std:.1f}, best {progress['best_return']:.1f}, "
-                          f"{scalars['charts/SPS']:.0f} steps/s")  # fmt: skip
+                rate = f"best {progress['best_return']:.1f}, {scalars['charts/SPS']:.0f} steps/s"
+                bar.write(f"step {step:,}: evaluation return {mean:.1f} +- {std:.1f}, {rate}")
         for name, value in scalars.items():
             writer.add_scalar(name, value, step)
+
+        # Checkpoints
         if due(args.save_every):
             checkpoint(f"step_{step}.pt")
-        if due(args.checkpoint_interval) or finished or signals:
+        if due(args.checkpoint_interval) or step == last_step or signals:
             writer.flush()
             progress["wall_seconds"], clock = progress["wall_seconds"] + time.time() - clock, time.time()
             checkpoint("last.pt", moments=moments, envs=envs.state(), rng=rng.bit_generator.state, compiled=compiled,
@@ -931,19 +942,15 @@ def main():
     for summary in hparams(flags, metrics):  # add_hparams would make a subfolder
         writer.file_writer.add_summary(summary)
     for name, value in metrics.items():
-        writer.add_scalar(name, value, step + 1)  # one on, so that a kill before result.json does not leave it twice
+        writer.add_scalar(name, value, step + 1)  # one on: if a kill precedes result.json, the resume drops it
     writer.close()
     late = progress["late_returns"]
-    result = {
-        "env_id": args.env_id,
-        "exp_name": args.exp_name,
-        "seed": args.seed,
-        "total_timesteps": args.total_timesteps,
-        "refinement_depth": getattr(args, "refinement_depth", None),
-        "refinement_schedule": getattr(args, "refinement_schedule", None),
-        **final,
+    result = {name: getattr(args, name) for name in ("env_id", "exp_name", "seed", "total_timesteps")}
+    result |= {name: getattr(args, name, None) for name in ("refinement_depth", "refinement_schedule")}  # null for PPO
+    result |= final
+    result |= {
         "std_ddof": 1,
-        "train_return_last10pct": mean_and_std(late)[0] if late else None,
+        "train_return_last10pct": float(np.mean(late)) if late else None,
         "wall_time_s": progress["wall_seconds"] + time.time() - clock,
         "sps": step / progress["train_seconds"],
     }

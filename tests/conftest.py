@@ -1,0 +1,33 @@
+"""Fixtures shared by all tests. The scripts are imported as modules; their commands run as a user types them."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # the tests themselves run in parallel
+ROOT = Path(__file__).parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+
+import pytest  # noqa: E402
+import torch  # noqa: E402
+
+import ppo_continuous  # noqa: E402
+import refineppo_continuous  # noqa: E402
+
+torch.set_num_threads(1)
+
+
+@pytest.fixture(params=[ppo_continuous, refineppo_continuous], ids=lambda module: module.__name__)
+def script(request):
+    """Each of the two training scripts, as a module."""
+    return request.param
+
+
+def run(name: str, *flags, cwd=ROOT, timeout=600, **env) -> subprocess.CompletedProcess:
+    """`python NAME FLAGS` in a process of its own; tests/ can be imported there, for `module:Env-v0` ids."""
+    paths = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+    return subprocess.run(
+        [sys.executable, str(ROOT / name), *map(str, flags)],
+        cwd=cwd, timeout=timeout, text=True, capture_output=True, env=os.environ | {"PYTHONPATH": paths} | env,
+    )  # fmt: skip

@@ -1,0 +1,175 @@
+"""Tiny environments, each of which asks one thing; use them as `probe_envs:NAME-v0`.
+
+Learning; the observation is uniform in [-1, 1], the actions are bounded by +-1:
+    ConstantReward-v0   one step, reward 1: the value must become 1
+    MatchAction-v0      one step: act as the observation says, a* = -s
+    TwoStepCredit-v0    two steps: the first action decides the reward of the second step
+    Coordination-v0     one step: the paper's task, a1* = phi(s), a2* = psi(s, a1*)
+The reward is minus the squared distance from the right action.
+
+Bookkeeping; the observation is the number of steps in the episode, the reward of step n is n, the action is ignored:
+    Counter-v0          truncated after 7 steps (max_episode_steps)
+    Terminator-v0       terminated after 5 steps
+
+Failures; episodes of 50 steps, and 100 sound steps over all episodes, counted from the environment's making:
+    NanReward-v0        then every reward is NaN
+    InfReward-v0        then every reward is infinite
+    NanObs-v0           then every observation is NaN
+    Crash-v0            then every step raises RuntimeError
+
+Spaces; episodes of 50 steps with reward 0:
+    Unbounded-v0        two actions without bounds
+    Discrete-v0         two discrete actions, unsupported
+    DictObs-v0          observations in a dict, unsupported
+    ImageObs-v0         observations of three dimensions, unsupported
+"""
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box, Dict, Discrete
+
+
+class Probe(gym.Env):
+    """Uniform random observations and reward 0, without an end."""
+
+    observation_space = Box(-1, 1, (1,))
+    action_space = Box(-1, 1, (1,))
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+
+    def observe(self):
+        self.obs = self.np_random.uniform(-1, 1, self.observation_space.shape).astype(np.float32)
+        return self.obs
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observe(), {}
+
+    def step(self, action):
+        return self.observe(), 0.0, False, False, {}
+
+
+class ConstantReward(Probe):
+    def step(self, action):
+        return self.observe(), 1.0, True, False, {}
+
+
+class MatchAction(Probe):
+    def step(self, action):
+        reward = -float((action[0] + self.obs[0]) ** 2)
+        return self.observe(), reward, True, False, {}
+
+
+class TwoStepCredit(Probe):
+    """Observes (s, 0), then (0, 1); the second reward is -(a + s)^2 of the first step."""
+
+    observation_space = Box(-1, 1, (2,))
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        self.obs[1] = 0
+        self.delayed = None
+        return self.obs, {}
+
+    def step(self, action):
+        if self.delayed is not None:
+            return np.zeros(2, np.float32), self.delayed, True, False, {}
+        self.delayed = -float((action[0] + self.obs[0]) ** 2)
+        return np.array([0, 1], np.float32), 0.0, False, False, {}
+
+
+def phi(s):
+    return np.sin(2 * s)
+
+
+def psi(s, a1):
+    return s * a1
+
+
+class Coordination(Probe):
+    """Section "Why Iterative Action Refinement Can Work" of the paper."""
+
+    action_space = Box(-1, 1, (2,))
+
+    def step(self, action):
+        s = self.obs[0]
+        reward = -float((action[0] - phi(s)) ** 2 + (action[1] - psi(s, phi(s))) ** 2)
+        return self.observe(), reward, True, False, {}
+
+
+class Counter(Probe):
+    observation_space = Box(0, np.inf, (1,))
+    last_step = None
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        return np.full(1, self.steps, np.float32), float(self.steps), self.steps == self.last_step, False, {}
+
+
+class Terminator(Counter):
+    last_step = 5
+
+
+class Failing(Probe):
+    steps = 0
+
+    def step(self, action):
+        self.steps += 1
+        outcome = super().step(action)
+        return outcome if self.steps <= 100 else self.fail(outcome)
+
+
+class NanReward(Failing):
+    def fail(self, outcome):
+        return outcome[0], np.nan, *outcome[2:]
+
+
+class InfReward(Failing):
+    def fail(self, outcome):
+        return outcome[0], np.inf, *outcome[2:]
+
+
+class NanObs(Failing):
+    def fail(self, outcome):
+        return np.full_like(outcome[0], np.nan), *outcome[1:]
+
+
+class Crash(Failing):
+    def fail(self, outcome):
+        raise RuntimeError("the simulator crashed")
+
+
+class Unbounded(Probe):
+    action_space = Box(-np.inf, np.inf, (2,))
+
+
+class DiscreteActions(Probe):
+    action_space = Discrete(2)
+
+
+class DictObs(Probe):
+    observation_space = Dict(position=Box(-1, 1, (1,)))
+
+    def observe(self):
+        return {"position": self.np_random.uniform(-1, 1, 1).astype(np.float32)}
+
+
+class ImageObs(Probe):
+    observation_space = Box(0, 255, (8, 8, 3), np.uint8)
+
+    def observe(self):
+        return self.np_random.integers(0, 256, (8, 8, 3), np.uint8)
+
+
+for env in (ConstantReward, MatchAction, TwoStepCredit, Coordination, Terminator):
+    gym.register(f"{env.__name__}-v0", env)
+gym.register("Counter-v0", Counter, max_episode_steps=7)
+gym.register("Discrete-v0", DiscreteActions, max_episode_steps=50)
+for env in (NanReward, InfReward, NanObs, Crash, Unbounded, DictObs, ImageObs):
+    gym.register(f"{env.__name__}-v0", env, max_episode_steps=50)
