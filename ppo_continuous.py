@@ -234,7 +234,7 @@ class Environments:
 
     def __init__(self, env_id: str, num_envs: int, seed: int):
         self.env_id, self.seed = env_id, seed
-        self.envs = [make_env(env_id) for _ in range(num_envs)]
+        self.envs = [None] * num_envs
         self.episodes = [0] * num_envs  # episodes started
         self.actions = [[] for _ in range(num_envs)]  # since the running episode's start
         self.returns = [0.0] * num_envs  # of the running episode, raw: before any normalisation
@@ -242,9 +242,8 @@ class Environments:
 
     def reset(self, i: int) -> np.ndarray:
         """Start environment i's next episode."""
-        if "BipedalWalker" in self.env_id and self.episodes[i]:
-            self.envs[i].close()  # it reuses its Box2D world, whose state leaks into the next episode:
-            self.envs[i] = make_env(self.env_id)  # only a new world can be replayed exactly
+        if self.envs[i] is None or "BipedalWalker" in self.env_id:  # this one's Box2D world keeps state between
+            self.envs[i] = make_env(self.env_id)  # episodes: only in a new world can one be replayed exactly
         (seed,) = episode_seeds(self.seed, 0, i, self.episodes[i])
         self.episodes[i] += 1
         self.actions[i], self.returns[i] = [], 0.0
@@ -267,7 +266,7 @@ class Environments:
         for i, action in enumerate(actions):
             obs, reward, terminal, timeout = self.step_one(i, action)
             if terminal or timeout:
-                ended[i] = obs, self.returns[i], len(self.actions[i])
+                ended[i] = np.array(obs), self.returns[i], len(self.actions[i])
                 obs = self.reset(i)
             self.obs[i] = obs
             rewards.append(reward)
@@ -612,6 +611,8 @@ def compile_update(agent: Agent, moments) -> tuple:
     index = torch.arange(args.batch_size // args.num_minibatches, device=agent.device)
     if args.cuda:
         options = {"triton.cudagraphs": True}
+        for x in tensors:
+            torch._dynamo.mark_static_address(x)  # a graph may update in place only what never moves
     else:  # C++ calls the kernels; tanh from exp; and on small matrices a bias in the next kernel is faster than addmm
         options = {"cpp_wrapper": True, "cpp.use_decompose_tanh": True, "pattern_matcher": False}
     options["guard_filter_fn"] = torch.compiler.skip_all_guards_unsafe
@@ -803,6 +804,7 @@ def main():
         return evaluate_checkpoint(Path(args.evaluate), args)
     obs_space, action_space = check_args(args)
     run_dir, saved = open_run(args)
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # without it cuBLAS refuses to be deterministic
     torch.use_deterministic_algorithms(args.torch_deterministic)
     clock, signals = time.time(), []
 
