@@ -13,6 +13,8 @@ is larger than the arithmetic), whatever acting does not need is computed once p
 minibatch update (loss, gradient, clipping, Adam) is one compiled function.
 """
 
+import errno
+import fcntl
 import io
 import json
 import math
@@ -37,6 +39,7 @@ import mujoco
 import numpy as np
 import torch
 import tyro
+from threadpoolctl import threadpool_limits
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 from tqdm import tqdm
@@ -200,6 +203,8 @@ def check_args(args: Args) -> tuple[gym.spaces.Box, gym.spaces.Box]:
     except Exception as error:  # unknown id, missing module or package: whatever gymnasium or the module raises
         refuse(f"cannot make the task {args.env_id}: {first_line(error)}")
     task.close()
+    if task.spec.max_episode_steps is None and not args.evaluate:
+        print(f"warning: {args.env_id} has no time limit; --resume replays the running episode, however long")
     for what, space in (("observations", task.observation_space), ("actions", task.action_space)):
         if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1 or space.shape[0] < 1:
             refuse(f"{args.env_id} has {what} in {space}; only a one-dimensional Box is supported")
@@ -357,7 +362,7 @@ class Normalizer:
         As in gymnasium and CleanRL, a truncation does not reset G, and a terminal reward leaks into the next episode.
         """
         if not self.args.normalize_reward:
-            return rewards
+            return rewards.copy()
         discounted = discounted_sums(rewards, self.args.gamma * (1.0 - terminated), self.discounted)
         self.discounted[...] = discounted[-1]
         variance = self.returns.update_each(discounted)
@@ -464,6 +469,7 @@ class Rollout:
     """T steps in N environments, and the episodes that ended in them."""
 
     obs: np.ndarray  # (T + 1, N, obs_dim), normalised
+    next_obs: np.ndarray  # (T, N, obs_dim), raw, what each step led to: the last observation where an episode ended
     actions: np.ndarray  # (T, N, action_dim), before they are clipped to the bounds
     logprobs: np.ndarray  # (T, N)
     rewards: np.ndarray  # (T, N), raw
@@ -485,20 +491,23 @@ def collect(agent: Agent, envs: Environments, obs: np.ndarray, num_steps: int, r
     # the density of a depends on the noise alone: a - m = exp(log_std) * noise
     logprobs = -(0.5 * noise**2 + log_std + 0.5 * math.log(2 * math.pi)).sum(-1)
     all_obs, actions = np.empty((num_steps + 1, *obs.shape), np.float32), np.empty_like(noise)
+    next_obs = np.empty((num_steps, *obs.shape))
     outcomes, final_obs, episodes = [], {}, []
     for t in range(num_steps):
         all_obs[t] = obs
         actions[t] = agent.actor.mean(weights, obs) + perturbation[t]
         raw_obs, *outcome, ended = envs.step(np.minimum(np.maximum(actions[t], agent.low), agent.high))
         outcomes.append(outcome)
+        next_obs[t] = raw_obs
         if ended:  # last observations are counted too, before the ones that follow, as in gymnasium's wrapper
-            last_obs = agent.normalizer.observe(np.stack([last for last, _, _ in ended.values()]))
+            next_obs[t, list(ended)] = [last for last, _, _ in ended.values()]
+            last_obs = agent.normalizer.observe(next_obs[t, list(ended)])
             final_obs |= {(t, i): last for i, last in zip(ended, last_obs)}
             episodes += [((t + 1) * num_envs, episode_return, length) for _, episode_return, length in ended.values()]
         obs = agent.normalizer.observe(raw_obs)
     all_obs[-1] = obs
     rewards, terminated, truncated = map(np.array, zip(*outcomes))
-    return Rollout(all_obs, actions, logprobs, rewards, terminated, truncated, final_obs, episodes)
+    return Rollout(all_obs, next_obs, actions, logprobs, rewards, terminated, truncated, final_obs, episodes)
 
 
 def gae(rewards: np.ndarray, values: np.ndarray, ends: np.ndarray, gamma: float, gae_lambda: float) -> np.ndarray:
@@ -733,7 +742,7 @@ def describe_machine() -> dict:
     git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
     commit = subprocess.run(git, capture_output=True, text=True).stdout.strip() if shutil.which("git") else ""
     cpu = Path("/proc/cpuinfo").read_text() if sys.platform == "linux" else ""
-    versions = {name: version(name) for name in ("torch", "numpy", "gymnasium", "mujoco")}
+    versions = {name: version(name) for name in ("torch", "numpy", "gymnasium", "mujoco", "box2d")}
     return {
         "versions": {"python": platform.python_version(), **versions},
         "git_commit": commit or None,
@@ -742,12 +751,25 @@ def describe_machine() -> dict:
     }
 
 
+def changed_flags(args: dict, others: dict) -> list[str]:
+    """The flags that a run cannot change when it is continued, and which differ."""
+    if args.keys() != others.keys():
+        raise KeyError
+    return [name for name in args if name not in FREE_ON_RESUME and args[name] != others[name]]
+
+
 def open_run(args: Args) -> tuple[Path, dict | None]:
     """The run's folder, made if need be, and the checkpoint to continue from, if any. Never overwrites a run."""
     run_dir = Path(args.run_dir or f"runs/{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}")
     config = json.loads(json.dumps({"args": asdict(args), **describe_machine()}))  # tuples as lists, as in the file
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
+        try:
+            fcntl.flock(os.open(run_dir, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
+        except BlockingIOError:
+            refuse(f"another process is at work in {run_dir}")
+        except OSError:  # this file system has no locks
+            pass
         if any(run_dir.iterdir()) and not args.resume:
             refuse(f"the run folder {run_dir} is not empty; name another --run-dir, or continue its run with --resume")
         if not (run_dir / "config.json").exists():
@@ -755,7 +777,9 @@ def open_run(args: Args) -> tuple[Path, dict | None]:
                 refuse(f"the run in {run_dir} has lost its config.json, so that it cannot be continued")
             write_atomically(run_dir / "config.json", json.dumps(config, indent=2).encode())
         old = json.loads((run_dir / "config.json").read_text())
-        changed = [k for k, v in config["args"].items() if k not in FREE_ON_RESUME and old["args"][k] != v]
+        changed = changed_flags(config["args"], old["args"])
+        if old.keys() != config.keys():
+            raise KeyError
     except OSError as error:
         refuse(f"cannot write to the run folder {run_dir}: {error.strerror}")
     except (ValueError, KeyError, TypeError):
@@ -766,13 +790,21 @@ def open_run(args: Args) -> tuple[Path, dict | None]:
     if (run_dir / "result.json").exists():
         print(f"the run in {run_dir} is finished")
         raise SystemExit(0)
+    for leftover in (*run_dir.glob("*.tmp"), run_dir / "failure.json"):  # of a process that was killed or failed
+        leftover.unlink(missing_ok=True)
     if not (run_dir / "last.pt").exists():
+        for leftover in run_dir.glob("events.out.tfevents.*"):
+            leftover.unlink()
+        write_atomically(run_dir / "config.json", json.dumps(config, indent=2).encode())
         return run_dir, None
     if old["versions"] != config["versions"]:
         refuse(f"the run in {run_dir} can be continued exactly with its own versions only: {old['versions']}")
     if old["cpu"] != config["cpu"]:
         print(f"warning: begun on {old['cpu']}; on {config['cpu']} the last bits of its numbers may differ")
-    return run_dir, load_checkpoint(run_dir / "last.pt")
+    saved = load_checkpoint(run_dir / "last.pt")
+    if changed_flags(saved["args"], asdict(args)) or "moments" not in saved:
+        refuse(f"{run_dir / 'last.pt'} is no checkpoint to continue the run in {run_dir} from")
+    return run_dir, saved
 
 
 def fail_numerically(run_dir: Path, **facts):
@@ -785,10 +817,10 @@ def fail_numerically(run_dir: Path, **facts):
 
 def check_rollout(run_dir: Path, roll: Rollout, step: int):
     """Fail at the first reward or observation that is not finite."""
-    bad = ~np.isfinite(roll.rewards) | ~np.isfinite(roll.obs[1:]).all(-1)
+    bad = ~np.isfinite(roll.rewards) | ~np.isfinite(roll.next_obs).all(-1)
     if bad.any():
         t, i = np.argwhere(bad)[0].tolist()
-        values = {"reward": roll.rewards[t, i], "action": roll.actions[t, i], "next_obs": roll.obs[t + 1, i]}
+        values = {"reward": roll.rewards[t, i], "action": roll.actions[t, i], "next_obs": roll.next_obs[t, i]}
         values = {name: str(value.tolist()) for name, value in values.items()}  # JSON has no NaN
         step += (t + 1) * bad.shape[1]
         fail_numerically(run_dir, what="a reward or an observation", global_step=step, env=i, **values)
@@ -800,12 +832,9 @@ def check_rollout(run_dir: Path, roll: Rollout, step: int):
 def main():
     args = tyro.cli(Args, description=__doc__)
     torch.set_num_threads(args.num_threads)
+    threadpool_limits(args.num_threads)  # NumPy's: their number decides the last bits, too
     if args.evaluate:
         return evaluate_checkpoint(Path(args.evaluate), args)
-    obs_space, action_space = check_args(args)
-    run_dir, saved = open_run(args)
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # without it cuBLAS refuses to be deterministic
-    torch.use_deterministic_algorithms(args.torch_deterministic)
     clock, signals = time.time(), []
 
     def request_stop(signum, _):
@@ -821,13 +850,17 @@ def main():
 
     for signum in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1):
         signal.signal(signum, request_stop)
+    obs_space, action_space = check_args(args)
+    run_dir, saved = open_run(args)
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # without it cuBLAS refuses to be deterministic
+    torch.use_deterministic_algorithms(args.torch_deterministic)
 
     # All that training changes, and what an earlier process has saved of it
     agent = Agent(obs_space, action_space, args)
     moments = init_moments(agent.params)
     envs, rng = Environments(args.env_id, args.num_envs, args.seed), np.random.default_rng(args.seed)
-    progress = {"global_step": 0, "adam_steps": 0, "best_return": -math.inf, "late_returns": [], "train_seconds": 0.0,
-                "wall_seconds": 0.0}  # fmt: skip
+    progress = {"global_step": 0, "adam_steps": 0, "best_return": -math.inf, "evaluations": [], "late_returns": [],
+                "train_seconds": 0.0, "wall_seconds": 0.0}  # fmt: skip
     if saved:
         agent.load(saved)
         copy_into(moments, saved["moments"])
@@ -840,19 +873,22 @@ def main():
     def checkpoint(name: str, **more):
         save_checkpoint(run_dir / name, {"args": asdict(args), "global_step": step, **agent.tensors(), **more})
 
+    def write_evaluations():
+        rows = ["global_step,return_mean,return_std,return_min,return_max,length_mean", *progress["evaluations"]]
+        write_atomically(run_dir / "evaluations.csv", "".join(f"{row}\n" for row in rows).encode())
+
     # Logs; a resumed run drops what followed its checkpoint, since it will log that again
-    evaluations = run_dir / "evaluations.csv"
-    rows = evaluations.read_text().splitlines(keepends=True)[1:] if saved else []
-    rows = [row for row in rows if row.endswith("\n") and int(row.split(",")[0]) <= step]
-    header = "global_step,return_mean,return_std,return_min,return_max,length_mean\n"
-    write_atomically(evaluations, "".join([header, *rows]).encode())
+    write_evaluations()
     if args.track:
         import_module("wandb").init(project=args.wandb_project_name, entity=args.wandb_entity, name=run_dir.name,
                                     dir=run_dir, config=asdict(args), sync_tensorboard=True)  # fmt: skip
-    writer = SummaryWriter(run_dir, purge_step=step + 1 if saved else 0)
+    writer = SummaryWriter(run_dir, purge_step=step + 1 if saved else None)
     if not saved:
         table = "".join(f"|{name}|{value}|\n" for name, value in asdict(args).items())
         writer.add_text("hyperparameters", f"|flag|value|\n|-|-|\n{table}")
+        flags = {k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in asdict(args).items()}
+        for summary in hparams(flags, {"final/best_mean": 0, "final/last_mean": 0}):
+            writer.file_writer.add_summary(summary)  # add_hparams would make a subfolder
     update_function, compiled = compile_update(agent, moments) if args.compile else (update, False)
     exit_if_stopped()
     if saved and saved["compiled"] != compiled:
@@ -876,9 +912,12 @@ def main():
         progress["adam_steps"] += updates
         step = progress["global_step"] = step + args.batch_size
         scalars = {f"losses/{name}": value for name, value in zip(LOSSES, losses)}
-        if not np.isfinite(losses).all() or not all(p.isfinite().all() for p in agent.params.values()):
+        tensors = {**agent.params, **agent.normalizer.tensors()}
+        bad = [name for name, x in (scalars | tensors).items() if not torch.as_tensor(x).isfinite().all()]
+        if bad:
             values = {name: str(value) for name, value in scalars.items()}
-            fail_numerically(run_dir, what="a loss, the gradient or a parameter", global_step=step, **values)
+            what = "a loss, the gradient, a parameter or a running statistic"
+            fail_numerically(run_dir, what=what, global_step=step, not_finite=bad, **values)
 
         # Logs
         scalars |= {"losses/explained_variance": explained_variance, "charts/learning_rate": learning_rate,
@@ -902,8 +941,9 @@ def main():
                 fail_numerically(run_dir, what="an evaluation return", global_step=step, returns=str(returns.tolist()))
             mean, std = mean_and_std(returns)
             scalars |= {"eval/return_mean": mean, "eval/return_std": std, "eval/episode_length": lengths.mean()}
-            with evaluations.open("a") as file:
-                file.write(f"{step},{mean},{std},{returns.min()},{returns.max()},{lengths.mean()}\n")
+            row = step, mean, std, returns.min(), returns.max(), lengths.mean()
+            progress["evaluations"].append(",".join(map(str, row)))
+            write_evaluations()
             if mean > progress["best_return"]:
                 progress["best_return"] = mean
                 checkpoint("best.pt", selection_return=mean)
@@ -922,9 +962,9 @@ def main():
             progress["wall_seconds"], clock = progress["wall_seconds"] + time.time() - clock, time.time()
             checkpoint("last.pt", moments=moments, envs=envs.state(), rng=rng.bit_generator.state, compiled=compiled,
                        progress=progress)  # fmt: skip
+            exit_if_stopped()
         bar.set_postfix_str(f"return {last_return}, evaluation {last_eval}", refresh=False)
         bar.update(args.batch_size)
-        exit_if_stopped()
     bar.close()
 
     # The final evaluation; result.json is written last, since it says that the run is complete
@@ -940,9 +980,6 @@ def main():
         exit_if_stopped()
     final["best"]["selection_return"] = progress["best_return"]
     metrics = {f"final/{name}_mean": final[name]["mean"] for name in final}
-    flags = {k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in asdict(args).items()}
-    for summary in hparams(flags, metrics):  # add_hparams would make a subfolder
-        writer.file_writer.add_summary(summary)
     for name, value in metrics.items():
         writer.add_scalar(name, value, step + 1)  # one on: if a kill precedes result.json, the resume drops it
     writer.close()
@@ -963,4 +1000,9 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            raise
+        sys.exit(f"{SCRIPT}: error: {error.strerror}; every checkpoint saved before is intact")

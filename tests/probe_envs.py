@@ -7,7 +7,8 @@ Learning; the observation is uniform in [-1, 1], the actions are bounded by +-1:
     Coordination-v0     one step: the paper's task, a1* = phi(s), a2* = psi(s, a1*)
 The reward is minus the squared distance from the right action.
 
-Bookkeeping; the observation is the number of steps in the episode, the reward of step n is n, the action is ignored:
+Bookkeeping; the observation is the number of steps in the episode, the reward of step n is the integer n,
+the action is ignored:
     Counter-v0          truncated after 7 steps (max_episode_steps)
     Terminator-v0       terminated after 5 steps
 
@@ -109,7 +110,7 @@ class Counter(Probe):
 
     def step(self, action):
         self.steps += 1
-        return np.full(1, self.steps, np.float32), float(self.steps), self.steps == self.last_step, False, {}
+        return np.full(1, self.steps, np.float32), self.steps, self.steps == self.last_step, False, {}
 
 
 class Terminator(Counter):

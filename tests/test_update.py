@@ -47,7 +47,7 @@ def eager_copy(agent) -> EagerAgent:
     """The reference's agent with the same parameters."""
     args = agent.args
     K, schedule = getattr(args, "refinement_depth", None), getattr(args, "refinement_schedule", "")
-    (obs_dim, action_dim) = len(agent.params["critic.0.weight"]), len(agent.params["log_std"])
+    obs_dim, action_dim = len(agent.params["critic.0.weight"]), len(agent.params["log_std"])
     eager = EagerAgent(obs_dim, action_dim, K, schedule, args.actor_hidden, args.critic_hidden)
     eager.to(agent.params["log_std"].dtype)
     with torch.no_grad():
@@ -87,21 +87,22 @@ def assert_close(actual, expected, tolerance):
 def test_loss_and_gradient(module, flags, norm_adv, clip_vloss):
     agent = make_agent(module, norm_adv=norm_adv, clip_vloss=clip_vloss, ent_coef=0.01, **flags)
     batch, eager = make_batch(agent), eager_copy(agent)
-    (loss, losses), expected = module.ppo_loss(agent.params, agent.actor, agent.args, *batch), {}
+    loss, losses = module.ppo_loss(agent.params, agent.actor, agent.args, *batch)
     expected_loss, expected_losses = eager_loss(eager, agent.args, *batch)
     assert_close({"loss": loss, "losses": losses}, {"loss": expected_loss, "losses": expected_losses}, 1e-10)
     assert 0.1 < losses[module.LOSSES.index("clipfrac")] < 0.9
 
     grads, _ = torch.func.grad(module.ppo_loss, has_aux=True)(agent.params, agent.actor, agent.args, *batch)
-    expected = with_our_names(eager)
-    expected = dict(zip(expected, torch.autograd.grad(expected_loss, list(expected.values()))))
-    assert_close(grads, expected, 1e-10)
+    expected_loss.backward()
+    for p in eager.parameters():
+        p.data = p.grad  # to read the gradients under the scripts' names
+    assert_close(grads, with_our_names(eager), 1e-10)
 
 
 @policies
 def test_update_equals_torch_adam_and_clip_grad_norm(module, flags):
     """200 minibatches, of four iterations with an annealed learning rate; some gradients are clipped, some are not."""
-    agent = make_agent(module, max_grad_norm=0.35, ent_coef=0.01, **flags)
+    agent = make_agent(module, max_grad_norm=1.2, ent_coef=0.01, **flags)
     args, moments, eager = agent.args, module.init_moments(agent.params), eager_copy(agent)
     optimizer, rng, norms = make_optimizer(eager, args), np.random.default_rng(0), []
     for iteration in range(4):
@@ -138,7 +139,7 @@ def test_every_epoch_visits_every_row_once(script):
     assert count == len(recorder.rows) == 3 * 8 and {len(rows) for rows in recorder.rows} == {32}
     epochs = [sum(recorder.rows[i : i + 8], []) for i in (0, 8, 16)]
     assert all(sorted(epoch) == list(range(256)) for epoch in epochs)
-    assert epochs[0] != epochs[1] != epochs[2] != epochs[0]
+    assert epochs[0] != epochs[1] != epochs[2]
     assert losses == [12.5] * len(script.LOSSES)  # the mean of 1 .. 24
     t = torch.arange(81, 105, dtype=torch.float64)  # Adam's steps go on from the 80 earlier ones
     sizes = torch.stack([1e-3 / (1 - 0.9**t), (1 - 0.999**t) ** -0.5], dim=1)
@@ -210,12 +211,10 @@ def test_actor_in_numpy_in_torch_and_in_the_plain_form(module, flags, hidden, dt
 @policies
 def test_rollout_logprobs_are_those_of_its_actions(module, flags):
     """`collect` computes them from the noise alone."""
-    args = module.Args(env_id="Pendulum-v1", num_envs=3, actor_hidden=(16,), critic_hidden=(8,), log_std_init=-0.7, **flags)
-    env = gym.make("Pendulum-v1")
-    agent = module.Agent(env.observation_space, env.action_space, args)
-    agent.params["actor.1.weight"] *= 50
-    agent.params["log_std"] += 0.2
+    args = module.Args(env_id="Pendulum-v1", num_envs=3, actor_hidden=(16,), log_std_init=-0.7, **flags)
     envs = module.Environments(args.env_id, args.num_envs, args.seed)
+    agent = module.Agent(envs.envs[0].observation_space, envs.envs[0].action_space, args)
+    agent.params["actor.1.weight"] *= 50
     first_obs = agent.normalizer.observe(envs.obs)
     roll = module.collect(agent, envs, first_obs, 250, np.random.default_rng(0))  # past an episode's end, at 200
     with torch.no_grad():
