@@ -815,7 +815,8 @@ def open_run(args: Args) -> tuple[Path, dict | None]:
             pass
         if any(run_dir.iterdir()) and not args.resume:
             refuse(f"the run folder {run_dir} is not empty; name another --run-dir, or continue its run with --resume")
-        if not (run_dir / "config.json").exists():
+        begun = (run_dir / "config.json").exists()
+        if not begun:
             if any((run_dir / name).exists() for name in ("last.pt", "result.json")):
                 refuse(f"the run in {run_dir} has lost its config.json, so that it cannot be continued")
             write_atomically(run_dir / "config.json", json.dumps(config, indent=2).encode())
@@ -833,8 +834,10 @@ def open_run(args: Args) -> tuple[Path, dict | None]:
     if (run_dir / "result.json").exists():
         print(f"the run in {run_dir} is finished")
         raise SystemExit(0)
-    for leftover in (*run_dir.glob("*.tmp"), run_dir / "failure.json"):  # of a process that was killed or failed
-        leftover.unlink(missing_ok=True)
+    if not begun:
+        return run_dir, None
+    for leftover in (*run_dir.glob("*.pt.tmp"), *run_dir.glob("*.json.tmp"), run_dir / "failure.json"):
+        leftover.unlink(missing_ok=True)  # of a process that was killed or failed
     if not (run_dir / "last.pt").exists():
         for leftover in run_dir.glob("events.out.tfevents.*"):
             leftover.unlink()
