@@ -549,8 +549,8 @@ def collect(agent: Agent, envs: Environments, obs: np.ndarray, num_steps: int, r
             episodes += [((t + 1) * num_envs, episode_return, length) for _, episode_return, length in ended.values()]
         obs = agent.normalizer.observe(raw_obs)
     all_obs[-1] = obs
-    rewards, terminated, truncated = map(np.array, zip(*outcomes))
-    return Rollout(all_obs, next_obs, actions, logprobs, rewards, terminated, truncated, final_obs, episodes)
+    rewards, *ends = map(np.array, zip(*outcomes))
+    return Rollout(all_obs, next_obs, actions, logprobs, rewards.astype(float), *ends, final_obs, episodes)
 
 
 def gae(rewards: np.ndarray, values: np.ndarray, ends: np.ndarray, gamma: float, gae_lambda: float) -> np.ndarray:
@@ -569,10 +569,11 @@ def prepare_batch(agent: Agent, roll: Rollout) -> tuple[list[torch.Tensor], floa
     obs = torch.from_numpy(roll.obs).to(agent.device)
     values = critic_value(weights, obs.flatten(0, 1)).view(obs.shape[:2]).cpu().numpy()
     rewards = agent.normalizer.scale_rewards(roll.rewards, roll.terminated)
-    if args.bootstrap_truncated:
-        for (t, i), last in roll.final_obs.items():
-            if not roll.terminated[t, i]:
-                rewards[t, i] += args.gamma * critic_value(weights, torch.from_numpy(last).to(agent.device)).item()
+    cut = [at for at in roll.final_obs if not roll.terminated[at]] if args.bootstrap_truncated else []
+    if cut:
+        final_obs = torch.from_numpy(np.stack([roll.final_obs[at] for at in cut])).to(agent.device)
+        for at, value in zip(cut, critic_value(weights, final_obs).tolist()):
+            rewards[at] += args.gamma * value
     advantages = gae(rewards, values, roll.terminated | roll.truncated, args.gamma, args.gae_lambda)
     returns = advantages + values[:-1]
     arrays = (roll.obs[:-1], roll.actions, roll.logprobs, advantages, returns, values[:-1])
