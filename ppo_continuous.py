@@ -220,7 +220,8 @@ mujoco.set_mju_user_warning(mujoco_warnings.append)
 def make_env(env_id: str, render_mode: str | None = None) -> gym.Env:
     """One environment of the task; what MuJoCo says of the model file while it loads is dropped."""
     seen = len(mujoco_warnings)
-    env = gym.make(env_id, render_mode=render_mode, disable_env_checker=True)
+    rendering = {"render_mode": render_mode} if render_mode else {}  # a task need not know the keyword
+    env = gym.make(env_id, disable_env_checker=True, **rendering)
     del mujoco_warnings[seen:]
     return env
 

@@ -85,7 +85,7 @@ def phi(s):
 
 
 def psi(s, a1):
-    return s * a1
+    return 2 * s * a1 - 1
 
 
 class Coordination(Probe):
