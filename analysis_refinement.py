@@ -4,14 +4,14 @@
     python analysis_refinement.py --checkpoint runs/seed-*/best.pt --sections settling r2 anytime adaptive dynamics
     python analysis_refinement.py --checkpoint runs/.../step_*.pt --sections training
 
-settling  how far each action component still is from its end after k steps: e_{k,j}, figure 3a of the paper
-r2        whether early components predict the next correction of late ones: delta R^2, figure 3b, beside three checks:
-          early components shuffled across states, folds of whole episodes, the observation added to both models
-anytime   return of the policy stopped after k = 0..2K steps; past K uniform goes on with c_k = 1, inverse with 1/k,
-          and average with its own 1/K
-adaptive  return and mean number of steps if a state's refinement stops once a correction is small
-dynamics  corrections, Jacobians of one step, the spread left of random starts, proposals outside the action bounds
-training  settling, r2 and dynamics against the training step, from several checkpoints of a run (`--save-every`)
+    settling  how far each action component still is from its end after k steps: e_{k,j}, figure 3a of the paper
+    r2        whether early components predict the next correction of late ones: delta R^2, figure 3b, beside three
+              checks: early components shuffled across states, folds of whole episodes, the observation in both models
+    anytime   return of the policy stopped after k = 0..2K steps; past K uniform goes on with c_k = 1, inverse with
+              1/k, and average with its own 1/K
+    adaptive  return and mean number of steps if a state's refinement stops once a correction is small
+    dynamics  corrections, Jacobians of one step, spread left of random starts, proposals outside the action bounds
+    training  settling, r2 and dynamics against the training step, from several checkpoints of a run (--save-every)
 
 Each section writes CSVs, figures and its part of summary.json into --out-dir, all at the end. With several checkpoints
 the CSVs gain a `checkpoint` column, and if these are seeds of one setting there are also `*_across_seeds.csv`, with the
@@ -43,6 +43,7 @@ from sklearn.linear_model import Ridge
 from sklearn.model_selection import GroupKFold, KFold, cross_val_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
+from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 import refineppo_continuous as refineppo
@@ -109,7 +110,8 @@ def load_policy(path: Path) -> Policy:
             refuse(f"{path} is a checkpoint of PPO, which has no refinement to analyse")
     saved = refineppo.load_checkpoint(path)
     try:
-        args = refineppo.Args(**saved["args"] | {"cuda": False, "track": False, "capture_video": False})
+        here = {"evaluate": str(path), "cuda": False, "track": False, "capture_video": False}
+        args = refineppo.Args(**saved["args"] | here)
         agent = Agent(*refineppo.check_args(args), args)
         agent.load(saved)
         step = int(saved["global_step"])
@@ -549,7 +551,8 @@ class Figures:
 
     def __init__(self, policies: list[Policy], episodes: int):
         args = policies[0].args
-        self.labels = {str(policy.path): policy.label for policy in policies}
+        labels = [policy.label for policy in policies]
+        self.labels = {str(p.path): p.label if labels.count(p.label) == 1 else str(p.path) for p in policies}
         self.single, self.seeds, self.episodes = len(policies) == 1, differ_in_seed(policies), episodes
         self.depth, self.schedule = args.refinement_depth, args.refinement_schedule
         self.title = f"{args.env_id}, $K = {self.depth}$, {self.schedule} schedule"
@@ -633,16 +636,16 @@ class Figures:
         rows = without(rows, "rank")
         rows += [{"checkpoint": path, "component": constant, "step": k, "error": 1 - c / done[-1]}
                  for path in self.labels for k, c in enumerate(done)]  # fmt: skip
-        heatmap = self.heatmaps("Remaining refinement by action component", rows, names, "step", "error",
-                                "$e_{k,j}$ (dark: far from its end)")  # fmt: skip
-        return {"settling_error": heatmap}
+        what, color = "Remaining refinement by action component", "$e_{k,j}$ (dark: far from its end)"
+        return {"settling_error": self.heatmaps(what, rows, names, "step", "error", color)}
 
     def r2(self, tables: dict[str, Rows]) -> dict[str, Figure]:
         """Figure 3b, and its numbers beside the three checks."""
         rows = [row | {"transition": f"{row['step_from']}→{row['step_to']}"} for row in tables["delta_r2"]]
         names = list(dict.fromkeys(row["component"] for row in rows))
-        heatmap = self.heatmaps("Earlier components inform later refinements", rows, names, "transition", "delta_r2",
-                                r"$\Delta R^2$ (dark: large)", "{:.3f}")  # fmt: skip
+        what = "What early components add to the prediction of late corrections"
+        color = r"$\Delta R^2$ (dark: large)"
+        heatmap = self.heatmaps(what, rows, names, "transition", "delta_r2", color, "{:.3f}")
         panels = grouped(tables["delta_r2_checks"], "checkpoint", "step_from")
         columns, height = min(4, self.depth - 1), 0.15 * max(map(len, panels.values())) + 0.9
         figure, axes = self.axes(r"$\Delta R^2$ and three checks", len(panels), columns, 1.8, height, sharex=True)
@@ -674,10 +677,8 @@ class Figures:
         if fixed:
             style = {"linestyle": ":", "fillstyle": "none"}
             self.curve(axis, fixed, "steps", "return_mean", label="the same number in every state", **style)
-        for row in tables["adaptive"] if self.single else []:
-            axis.annotate(f"{row['tolerance']:.2g}", (row["steps_mean"], row["return_mean"]), (3, 4),
-                          textcoords="offset points", size=6)  # fmt: skip
-        axis.set_xlabel("mean steps used" + " (beside the points: tolerance)" * self.single)
+        tolerance = max(row["tolerance"] for row in tables["adaptive"])
+        axis.set_xlabel(f"mean steps used (tolerance from 0 at $K$ to {tolerance:.2g} on the left)")
         self.legend(figure, axis)
         return {"adaptive": figure}
 
@@ -723,7 +724,7 @@ def as_png(figure: Figure) -> bytes:
 def main():
     args = tyro.cli(Args, description=__doc__)
     torch.set_num_threads(1)
-    torch.set_grad_enabled(False)
+    threadpool_limits(1)  # NumPy's
     policies = check(args)
     several, tables = len(policies) > 1, {}
     for policy in tqdm(policies, desc="checkpoints", disable=None if several else True):

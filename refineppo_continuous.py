@@ -27,6 +27,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 import zipfile
 from dataclasses import asdict, dataclass, fields
 from importlib import import_module
@@ -184,7 +185,7 @@ def check_args(args: Args) -> tuple[gym.spaces.Box, gym.spaces.Box]:
         ("positive", "learning_rate clip_coef max_grad_norm target_kl", lambda x: 0 < x < math.inf),
         ("between 0 and 1", "gamma gae_lambda", lambda x: 0 <= x <= 1),
         ("a finite number", "ent_coef vf_coef log_std_init", math.isfinite),
-        ("0 or more", "seed", lambda x: x >= 0),
+        ("from 0 to 2^63 - 1", "seed", lambda x: 0 <= x < 2**63),
     )
     for rule, names, holds in rules:
         for name in names.split():
@@ -208,7 +209,8 @@ def check_args(args: Args) -> tuple[gym.spaces.Box, gym.spaces.Box]:
     if args.cuda and not torch.cuda.is_available():
         refuse("--cuda was asked for, but torch finds no CUDA device")
     try:
-        task = make_env(args.env_id)
+        with warnings.catch_warnings(action="ignore"):  # shown again when training makes its environments
+            task = make_env(args.env_id)
     except Exception as error:  # unknown id, missing module or package: whatever gymnasium or the module raises
         refuse(f"cannot make the task {args.env_id}: {first_line(error)}")
     task.close()
@@ -218,6 +220,12 @@ def check_args(args: Args) -> tuple[gym.spaces.Box, gym.spaces.Box]:
         if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1 or space.shape[0] < 1:
             refuse(f"{args.env_id} has {what} in {space}; only a one-dimensional Box is supported")
     return task.observation_space, task.action_space
+
+
+def limit_threads(args: Args):
+    """torch's threads and NumPy's, the number of which decides the last bits of their results."""
+    torch.set_num_threads(args.num_threads)
+    threadpool_limits(args.num_threads)
 
 
 # --- Environment ------------------------------------------------------------------------------------------------------
@@ -729,9 +737,10 @@ def mean_and_std(x) -> tuple[float, float]:
 def evaluate_checkpoint(path: Path, given: Args):
     """--evaluate: print a saved policy's returns, which for best.pt and last.pt are those in result.json."""
     checkpoint = load_checkpoint(path)
-    own = ("evaluate", "final_eval_episodes", "render", "capture_video", "num_threads", "cuda")
+    own = ("evaluate", "final_eval_episodes", "render", "capture_video", "num_threads", "cuda", "track")
     args = Args(**checkpoint["args"] | {name: getattr(given, name) for name in own})
     agent = Agent(*check_args(args), args)
+    limit_threads(args)
     agent.load(checkpoint)
     videos = path.with_suffix(".videos") if args.capture_video else None
     if videos and videos.exists():
@@ -774,7 +783,7 @@ def load_checkpoint(path: Path) -> dict:
         if zipfile.ZipFile(path).testzip():  # torch.load looks at no checksum
             raise ValueError
         state = torch.load(path, map_location="cpu", weights_only=True)
-        flags = set(state["args"])
+        flags = set(state["args"]) if isinstance(state, dict) else set()
     except Exception:  # torn, foreign or malicious: the zip and pickle readers have many errors for it
         refuse(f"{path} is damaged or not a checkpoint of {SCRIPT}")
     if flags != {field.name for field in fields(Args)}:
@@ -874,14 +883,18 @@ def check_rollout(run_dir: Path, roll: Rollout, step: int):
         fail_numerically(run_dir, what="a reward or an observation", global_step=step, env=i, **values)
 
 
+def check_evaluation(run_dir: Path, returns: np.ndarray, step: int):
+    """Fail if an episode's return is not finite."""
+    if not np.isfinite(returns).all():
+        fail_numerically(run_dir, what="an evaluation return", global_step=step, returns=str(returns.tolist()))
+
+
 # --- Main -------------------------------------------------------------------------------------------------------------
 
 
 def main():
     args = tyro.cli(Args, description=__doc__)
-    torch.set_num_threads(args.num_threads)
-    threadpool_limits(args.num_threads)  # NumPy's: their number decides the last bits, too
-    if args.evaluate:
+    if args.evaluate is not None:
         return evaluate_checkpoint(Path(args.evaluate), args)
     clock, signals = time.time(), []
 
@@ -899,6 +912,7 @@ def main():
     for signum in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1):
         signal.signal(signum, request_stop)
     obs_space, action_space = check_args(args)
+    limit_threads(args)
     run_dir, saved = open_run(args)
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # without it cuBLAS refuses to be deterministic
     torch.use_deterministic_algorithms(args.torch_deterministic)
@@ -987,8 +1001,7 @@ def main():
         # Evaluation
         if due(args.eval_interval) or step == last_step:
             returns, lengths = evaluate(agent, evaluation_seeds(args, step))
-            if not np.isfinite(returns).all():
-                fail_numerically(run_dir, what="an evaluation return", global_step=step, returns=str(returns.tolist()))
+            check_evaluation(run_dir, returns, step)
             mean, std = mean_and_std(returns)
             scalars |= {"eval/return_mean": mean, "eval/return_std": std, "eval/episode_length": lengths.mean()}
             row = step, mean, std, returns.min(), returns.max(), lengths.mean()
@@ -1025,6 +1038,7 @@ def main():
         videos = run_dir / "videos" if args.capture_video and name == "best" else None
         seeds = evaluation_seeds(args, saved["global_step"], final=True)
         returns, _ = evaluate(agent, seeds, "rgb_array" if videos else None, videos)
+        check_evaluation(run_dir, returns, step)
         mean, std = mean_and_std(returns)
         final[name] = {"global_step": saved["global_step"], "returns": returns.tolist(), "mean": mean, "std": std}
         exit_if_stopped()

@@ -1,0 +1,337 @@
+"""analysis_refinement.py as a user runs it: its files, several checkpoints, every section, and what it refuses."""
+
+import csv
+import json
+import pickle
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import gymnasium as gym
+import matplotlib.image
+import numpy as np
+import pytest
+import torch
+from conftest import run
+
+import analysis_refinement as analysis
+import ppo_continuous
+import refineppo_continuous as refineppo
+
+COLUMNS = {
+    "settling_error": "component,rank,step,error",
+    "delta_r2": "component,step_from,step_to,r2_baseline,r2_augmented,delta_r2",
+    "delta_r2_checks": "component,step_from,step_to,delta_r2,shuffled_low,shuffled_high,above_shuffled,by_episode,"
+    "given_observation",
+    "anytime": "steps,return_mean,return_std,length_mean",
+    "adaptive": "quantile,tolerance,steps_mean,return_mean,return_std,length_mean",
+    "dynamics": "quantity,step,value,q10,q90",
+    "training": "seed,global_step,quantity,step,value",
+}
+TABLES_OF = {"settling": ["settling_error"], "r2": ["delta_r2", "delta_r2_checks"]}
+
+
+def save(path: Path, env_id="Reacher-v5", step=2048, script=refineppo, **flags) -> Path:
+    """A checkpoint as the training script writes it, of a policy whose f depends on m."""
+    args = script.Args(env_id=env_id, actor_hidden=(16, 16), **flags)
+    agent = script.Agent(*script.check_args(args), args)
+    agent.params["actor.2.weight"].mul_(50)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    script.save_checkpoint(path, {"args": asdict(args), "global_step": step, **agent.tensors()})
+    return path
+
+
+@pytest.fixture
+def analyse(monkeypatch):
+    """`python analysis_refinement.py FLAGS`, in this process; with few shuffles, whose fits take most of the time."""
+    monkeypatch.setattr(analysis, "SHUFFLES", 4)
+
+    def call(*flags):
+        monkeypatch.setattr(sys, "argv", ["analysis_refinement.py", *map(str, flags)])
+        analysis.main()
+
+    return call
+
+
+def read(path: Path) -> list[dict]:
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def header(path: Path) -> str:
+    return path.read_text().splitlines()[0]
+
+
+def assert_shows_something(path: Path):
+    """The picture opens, and neither is of one colour nor a dot on an empty page."""
+    pixels = matplotlib.image.imread(path)[..., :3]
+    assert min(pixels.shape[:2]) > 200
+    assert (pixels.min(-1) < 0.9).mean() > 0.01
+    assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 20
+
+
+def test_the_papers_two_analyses_are_the_default(tmp_path, analyse, capsys):
+    analyse("--checkpoint", save(tmp_path / "best.pt"), "--num-states", 40)
+    out = tmp_path / "analysis"
+    assert sorted(path.name for path in out.iterdir()) == [
+        "delta_r2.csv", "delta_r2.png", "delta_r2_checks.csv", "delta_r2_checks.png", "settling_error.csv",
+        "settling_error.png", "summary.json"]  # fmt: skip
+    for name in ("settling_error", "delta_r2", "delta_r2_checks"):
+        assert header(out / f"{name}.csv") == COLUMNS[name]
+        assert_shows_something(out / f"{name}.png")
+    rows = read(out / "settling_error.csv")
+    assert {row["component"] for row in rows} == {"joint0", "joint1"}
+    assert [row["step"] for row in rows] == ["0", "1", "2", "3", "4"] * 2
+    assert [row["rank"] for row in rows] == ["1"] * 5 + ["2"] * 5
+    late = rows[-1]["component"]
+    rows = read(out / "delta_r2.csv")
+    assert [(row["component"], row["step_from"], row["step_to"]) for row in rows] == [
+        (late, "1", "2"), (late, "2", "3"), (late, "3", "4")]  # fmt: skip
+    for row in rows:
+        assert float(row["delta_r2"]) == float(row["r2_augmented"]) - float(row["r2_baseline"])
+    summary = json.loads((out / "summary.json").read_text())
+    path = str(tmp_path / "best.pt")
+    assert summary["checkpoints"][path] == {"global_step": 2048, "env_id": "Reacher-v5", "seed": 1,
+                                            "refinement_depth": 4, "refinement_schedule": "average"}  # fmt: skip
+    assert summary["settling"][path]["settling_error"][late]["4"] == 0
+    mean = np.mean([float(row["delta_r2"]) for row in rows])
+    assert summary["r2"][path]["delta_r2"]["delta_r2"] == pytest.approx(mean)
+    printed = capsys.readouterr().out
+    assert late in printed and str(out) in printed
+
+
+def test_every_section_of_seventeen_actions(tmp_path, analyse):
+    """HumanoidStandup-v5 with short episodes: five early and five late components, all named after their joints."""
+    gym.register("ShortStandup-v0", "gymnasium.envs.mujoco.humanoidstandup_v5:HumanoidStandupEnv", max_episode_steps=8)
+    path = save(tmp_path / "best.pt", "ShortStandup-v0", refinement_schedule="inverse", refinement_depth=3)
+    sections = ("settling", "r2", "anytime", "adaptive", "dynamics")
+    analyse("--checkpoint", path, "--num-states", 80, "--episodes", 2, "--out-dir", tmp_path / "out",
+            "--sections", *sections)  # fmt: skip
+    for name, columns in COLUMNS.items():
+        if name != "training":
+            assert header(tmp_path / f"out/{name}.csv") == columns
+            assert_shows_something(tmp_path / f"out/{name}.png")
+    assert set(json.loads((tmp_path / "out/summary.json").read_text())) == {"flags", "checkpoints", *sections}
+    rows = read(tmp_path / "out/settling_error.csv")
+    assert len(rows) == 17 * 4
+    ordered = list(dict.fromkeys(row["component"] for row in rows))
+    assert len(ordered) == 17 and {"abdomen_y", "right_knee", "left_elbow"} < set(ordered)
+    rows = read(tmp_path / "out/delta_r2.csv")
+    assert list(dict.fromkeys(row["component"] for row in rows)) == ordered[-5:]
+    assert [row["steps"] for row in read(tmp_path / "out/anytime.csv")] == [str(k) for k in range(7)]
+
+
+@pytest.mark.parametrize("section", ["settling", "r2", "anytime", "adaptive", "dynamics"])
+def test_a_section_alone(section, tmp_path, analyse):
+    flags = "--sections", section, "--num-states", 20, "--episodes", 2
+    analyse("--checkpoint", save(tmp_path / "best.pt"), *flags)
+    names = TABLES_OF.get(section, [section])
+    files = sorted([f"{name}.{kind}" for name in names for kind in ("csv", "png")] + ["summary.json"])
+    assert sorted(path.name for path in (tmp_path / "analysis").iterdir()) == files
+    assert set(json.loads((tmp_path / "analysis/summary.json").read_text())) == {"flags", "checkpoints", section}
+
+
+def test_the_same_command_gives_the_same_tables(tmp_path, analyse):
+    path = save(tmp_path / "best.pt")
+    for out in ("a", "b"):
+        analyse("--checkpoint", path, "--num-states", 30, "--out-dir", tmp_path / out, "--sections", "r2", "dynamics")
+    for name in ("delta_r2", "delta_r2_checks", "dynamics"):
+        assert (tmp_path / f"a/{name}.csv").read_bytes() == (tmp_path / f"b/{name}.csv").read_bytes()
+
+
+def test_seeds_of_one_setting(tmp_path, analyse):
+    """Each seed's own rows as if analysed alone, and beside them the mean and standard deviation across seeds."""
+    paths = [save(tmp_path / f"seed-{seed}/best.pt", seed=seed) for seed in (1, 2, 3)]
+    sections = "--num-states", 30, "--episodes", 2, "--sections", "settling", "r2", "anytime", "adaptive", "dynamics"
+    analyse("--checkpoint", *paths, *sections)
+    analyse("--checkpoint", paths[1], *sections)
+    out, alone = tmp_path / "seed-1/analysis", tmp_path / "seed-2/analysis"
+    for name in set(COLUMNS) - {"training"}:
+        assert header(out / f"{name}.csv") == "checkpoint," + COLUMNS[name]
+        own = [row for row in read(out / f"{name}.csv") if row.pop("checkpoint") == str(paths[1])]
+        assert own == read(alone / f"{name}.csv")
+        assert not (alone / f"{name}_across_seeds.csv").exists()
+        assert_shows_something(out / f"{name}.png")
+    rows = read(out / "settling_error.csv")
+    across = read(out / "settling_error_across_seeds.csv")
+    assert len(across) == 2 * 5
+    for row in across:
+        errors = [float(r["error"]) for r in rows if (r["component"], r["step"]) == (row["component"], row["step"])]
+        assert int(row["seeds"]) == len(errors) == 3
+        assert float(row["error_mean"]) == pytest.approx(np.mean(errors))
+        assert float(row["error_std"]) == pytest.approx(np.std(errors, ddof=1), abs=1e-12)
+    assert list(json.loads((out / "summary.json").read_text())["settling"]) == list(map(str, paths))
+
+
+def test_a_run_through_training(tmp_path, analyse):
+    """Two seeds at two steps each: their own rows, and mean and std over the seeds at every training step."""
+    paths = [save(tmp_path / f"{seed}/step_{step}.pt", seed=seed, step=step) for seed in (1, 2) for step in (100, 200)]
+    analyse("--checkpoint", *paths, "--num-states", 20, "--sections", "training", "settling")
+    out = tmp_path / "1/analysis"
+    assert sorted(path.name for path in out.iterdir()) == [
+        "settling_error.csv", "settling_error.png", "summary.json", "training.csv", "training.png",
+        "training_across_seeds.csv"]  # fmt: skip
+    assert_shows_something(out / "training.png")
+    rows = read(out / "training.csv")
+    assert header(out / "training.csv") == "checkpoint," + COLUMNS["training"]
+    for path, (seed, step) in zip(paths, [("1", "100"), ("1", "200"), ("2", "100"), ("2", "200")]):
+        own = {(r["quantity"], r["step"]): float(r["value"]) for r in rows if r["checkpoint"] == str(path)}
+        assert {(r["seed"], r["global_step"]) for r in rows if r["checkpoint"] == str(path)} == {(seed, step)}
+        errors = [r for r in read(out / "settling_error.csv") if r["checkpoint"] == str(path)]
+        for k in range(5):
+            mean = np.mean([float(r["error"]) for r in errors if int(r["step"]) == k])
+            assert own["settling_error", str(k)] == pytest.approx(mean)
+        assert {step for quantity, step in own if quantity == "delta_r2"} == {"2", "3", "4"}
+        assert ("spectral_radius", "1") in own and ("spread_of_random_starts", "4") in own
+    across = read(out / "training_across_seeds.csv")
+    assert {row["seeds"] for row in across} == {"2"} and len(across) == len(rows) / 2
+
+
+def test_checkpoints_that_look_alike_keep_their_own_panels(tmp_path, analyse):
+    """best.pt and last.pt of one step: no mean across seeds, and the picture is as wide as two panels."""
+    paths = [save(tmp_path / name) for name in ("best.pt", "last.pt")]
+    analyse("--checkpoint", *paths, "--num-states", 20, "--sections", "settling")
+    analyse("--checkpoint", paths[0], "--num-states", 20, "--sections", "settling", "--out-dir", tmp_path / "one")
+    assert not (tmp_path / "analysis/settling_error_across_seeds.csv").exists()
+    widths = [matplotlib.image.imread(tmp_path / name / "settling_error.png").shape[1] for name in ("analysis", "one")]
+    assert widths[0] > widths[1]
+
+
+def test_a_one_dimensional_action_has_no_delta_r2(tmp_path, analyse, capsys):
+    analyse("--checkpoint", save(tmp_path / "best.pt", "Pendulum-v1"), "--num-states", 20)
+    assert sorted(path.name for path in (tmp_path / "analysis").iterdir()) == [
+        "settling_error.csv", "settling_error.png", "summary.json"]  # fmt: skip
+    assert "no delta R^2" in capsys.readouterr().out
+
+
+# --- Bad input --------------------------------------------------------------------------------------------------------
+
+
+class Malicious:
+    def __reduce__(self):
+        return Path.touch, (Path("executed"),)
+
+
+def change(path: Path, **parts) -> Path:
+    """The checkpoint with some of its parts replaced, or with None removed."""
+    state = torch.load(path, weights_only=True) | parts
+    refineppo.save_checkpoint(path, {name: part for name, part in state.items() if part is not None})
+    return path
+
+
+def malicious(path: Path) -> Path:
+    torch.save({"args": Malicious()}, path)
+    return path
+
+
+def torn(path: Path) -> Path:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    return path
+
+
+def foreign(path: Path) -> Path:
+    path.write_bytes(pickle.dumps({"args": {}}))
+    return path
+
+
+def with_param(path: Path, name: str, value: torch.Tensor) -> Path:
+    return change(path, params=torch.load(path, weights_only=True)["params"] | {name: value})
+
+
+def of_missing_task(path: Path) -> Path:
+    return change(path, args=torch.load(path, weights_only=True)["args"] | {"env_id": "no_such_module:Task-v0"})
+
+
+NAN = torch.full((2,), float("nan"))
+BAD_INPUT = {
+    "missing file": (lambda tmp: [tmp / "best.pt"], "there is no checkpoint"),
+    "folder": (lambda tmp: [tmp], "there is no checkpoint"),
+    "torn": (lambda tmp: [torn(save(tmp / "best.pt"))], "damaged"),
+    "malicious": (lambda tmp: [malicious(tmp / "best.pt")], "damaged"),
+    "foreign": (lambda tmp: [foreign(tmp / "best.pt")], "damaged"),
+    "part missing": (lambda tmp: [change(save(tmp / "best.pt"), params=None)], "damaged"),
+    "other shapes": (lambda tmp: [with_param(save(tmp / "best.pt"), "log_std", torch.zeros(3))], "damaged"),
+    "nan": (lambda tmp: [with_param(save(tmp / "best.pt"), "log_std", NAN)], "not finite"),
+    "ppo": (lambda tmp: [save(tmp / "best.pt", script=ppo_continuous)], "PPO"),
+    "one step": (lambda tmp: [save(tmp / "best.pt", refinement_depth=1)], "K = 1"),
+    "missing package": (lambda tmp: [of_missing_task(save(tmp / "best.pt"))], "no_such_module"),
+    "second one bad": (lambda tmp: [save(tmp / "best.pt"), torn(save(tmp / "last.pt"))], "damaged"),
+    "twice": (lambda tmp: [save(tmp / "best.pt"), tmp / "." / "best.pt"], "twice"),
+    "two tasks": (lambda tmp: [save(tmp / "a.pt"), save(tmp / "b.pt", "Pendulum-v1")], "same task"),
+    "two depths": (lambda tmp: [save(tmp / "a.pt"), save(tmp / "b.pt", refinement_depth=3)], "depth"),
+    "two schedules": (lambda tmp: [save(tmp / "a.pt"), save(tmp / "b.pt", refinement_schedule="uniform")], "schedule"),
+    "no checkpoint": (lambda tmp: [], "at least one"),
+    "no section": (lambda tmp: [save(tmp / "best.pt"), "--sections"], "at least one"),
+    "only r2 of one component": (lambda tmp: [save(tmp / "best.pt", "Pendulum-v1"), "--sections", "r2"], "delta R^2"),
+    "one training step": (lambda tmp: [save(tmp / "best.pt"), "--sections", "training"], "two or more"),
+    "seeds for training": (
+        lambda tmp: [save(tmp / "a.pt"), save(tmp / "b.pt", seed=2, step=4), "--sections", "training"], "two or more"),
+    "fewer states than folds": (lambda tmp: [save(tmp / "best.pt"), "--num-states", 4], "at least 10"),
+    "one state in a fold": (lambda tmp: [save(tmp / "best.pt"), "--num-states", 9], "at least 10"),
+    "one episode": (lambda tmp: [save(tmp / "best.pt"), "--episodes", 1], "--episodes"),
+    "negative seed": (lambda tmp: [save(tmp / "best.pt"), "--seed", -1], "--seed"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD_INPUT)
+def test_bad_input_is_refused(case, tmp_path, analyse, capsys, monkeypatch):
+    """One sentence, exit 2, no output folder, and nothing in the file is executed."""
+    monkeypatch.chdir(tmp_path)
+    make_flags, expected = BAD_INPUT[case]
+    (tmp_path / "in").mkdir()
+    flags = make_flags(tmp_path / "in")
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as exit:
+        analyse("--out-dir", tmp_path / "out", "--checkpoint", *flags)
+    assert exit.value.code == 2
+    printed = capsys.readouterr()
+    assert expected in printed.err
+    assert printed.err.startswith("analysis_refinement.py: error: ") and printed.err.count("\n") == 1
+    assert printed.out == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["in"]
+
+
+@pytest.mark.parametrize("out", ["file", "file/folder", "/proc/no/such"])
+def test_a_folder_that_cannot_be_written(out, tmp_path, analyse, capsys, monkeypatch):
+    """Refused before any work: no episode is run."""
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(refineppo, "evaluate", None)
+    with pytest.raises(SystemExit) as exit:
+        analyse("--checkpoint", save(tmp_path / "best.pt"), "--out-dir", tmp_path / out)
+    assert exit.value.code == 2
+    assert "cannot write to the output folder" in capsys.readouterr().err
+
+
+def test_a_full_disk_is_one_sentence(tmp_path, analyse, capsys, monkeypatch):
+    def full(path, data):
+        raise OSError(28, "No space left on device")
+
+    path = save(tmp_path / "best.pt")
+    monkeypatch.setattr(refineppo, "write_atomically", full)
+    with pytest.raises(SystemExit) as exit:
+        analyse("--checkpoint", path, "--num-states", 20, "--sections", "settling")
+    assert exit.value.code == 2
+    assert "No space left on device" in capsys.readouterr().err
+    assert not any((tmp_path / "analysis").iterdir())
+
+
+# --- The commands -----------------------------------------------------------------------------------------------------
+
+
+def test_training_and_then_its_analysis_as_a_user_types_them(tmp_path):
+    """A run of two iterations with --save-every; anytime at k = K is the mean of the run's own result.json."""
+    run_dir = tmp_path / "run"
+    training = run("refineppo_continuous.py", "--env-id", "Reacher-v5", "--total-timesteps", 512, "--num-steps", 256,
+                   "--num-minibatches", 4, "--update-epochs", 2, "--eval-episodes", 2, "--final-eval-episodes", 4,
+                   "--save-every", 256, "--no-compile", "--no-progress", "--run-dir", run_dir)  # fmt: skip
+    assert training.returncode == 0, training.stderr
+    done = run("analysis_refinement.py", "--checkpoint", run_dir / "step_256.pt", run_dir / "step_512.pt",
+               "--num-states", 40, "--episodes", 4, "--sections", "settling", "r2", "anytime", "training")  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    for name in ("settling_error", "delta_r2", "delta_r2_checks", "anytime", "training"):
+        assert header(run_dir / f"analysis/{name}.csv") == "checkpoint," + COLUMNS[name]
+        assert name in done.stdout
+    rows = [row for row in read(run_dir / "analysis/anytime.csv") if row["checkpoint"].endswith("step_512.pt")]
+    result = json.loads((run_dir / "result.json").read_text())
+    assert float(rows[4]["return_mean"]) == result["last"]["mean"]
+    assert float(rows[4]["return_std"]) == result["last"]["std"]

@@ -1,0 +1,229 @@
+"""The real command lines: all tasks of the paper, the files that a run leaves, the flags and their help."""
+
+import ast
+import csv
+import inspect
+import json
+import re
+import shutil
+import signal
+import sys
+import sysconfig
+from dataclasses import fields
+from pathlib import Path
+from unittest import mock
+
+import gymnasium as gym
+import pytest
+import torch
+from conftest import run
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
+
+import refineppo_continuous
+
+TASKS = """
+    Ant-v5 HalfCheetah-v5 Hopper-v5 Walker2d-v5 Swimmer-v5 Pusher-v5 Reacher-v5 HumanoidStandup-v5 Humanoid-v5
+    Pendulum-v1 MountainCarContinuous-v0 LunarLanderContinuous-v3 BipedalWalker-v3 BipedalWalkerHardcore-v3
+""".split()
+QUICK = "--no-compile --num-steps 32 --num-minibatches 2 --update-epochs 1 --eval-episodes 1 --final-eval-episodes 1"
+QUICK = (*QUICK.split(), *"--actor-hidden 16 --critic-hidden 16 --total-timesteps 64".split())
+
+CHARTS = {"charts/learning_rate", "charts/SPS"}
+EPISODES = {"charts/episodic_return", "charts/episodic_length"}
+LOSSES = "policy_loss value_loss entropy old_approx_kl approx_kl clipfrac explained_variance grad_norm"
+EVALUATION = {f"eval/{name}" for name in ("return_mean", "return_std", "episode_length")}
+REFINEMENT = {
+    f"refinement/{name}_{k}" for name in ("correction_norm", "settling_error", "outside_bounds") for k in (1, 2, 3, 4)
+}
+
+
+def call_main(script, *flags):
+    """`main()` in this process, as with these flags on the command line; signals and torch are then as before."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)}
+    try:
+        with mock.patch.object(sys, "argv", [script.__file__, *map(str, flags)]):
+            script.main()
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        torch.use_deterministic_algorithms(False)
+        torch.set_num_threads(1)
+
+
+def read_events(run_dir: Path) -> EventAccumulator:
+    """All of the run's one event file."""
+    (path,) = run_dir.rglob("events.out.tfevents.*")
+    assert path.parent == run_dir
+    return EventAccumulator(str(path), size_guidance={"scalars": 0}).Reload()
+
+
+def tags(run_dir: Path, prefix: str = "") -> set[str]:
+    return {tag for tag in read_events(run_dir).Tags()["scalars"] if tag.startswith(prefix)}
+
+
+def read_json(path: Path):
+    """Strict JSON: Python also reads NaN and Infinity, which others do not."""
+    return json.loads(path.read_text(), parse_constant=lambda name: pytest.fail(f"{name} in {path}"))
+
+
+def check_files(run_dir: Path):
+    names = {re.sub(r"tfevents\..*", "tfevents", path.name) for path in run_dir.iterdir()}
+    assert names == {"best.pt", "last.pt", "config.json", "evaluations.csv", "result.json", "events.out.tfevents"}
+
+
+def check_config(run_dir: Path, script, env_id: str):
+    config = read_json(run_dir / "config.json")
+    assert set(config["args"]) == {field.name for field in fields(script.Args)}
+    assert config["args"]["env_id"] == env_id
+    assert config["versions"]["torch"] == torch.__version__
+    assert config["versions"]["gymnasium"] == gym.__version__
+    assert {"python", "numpy", "mujoco"} <= set(config["versions"])
+    assert {"git_commit", "cpu", "gpu"} <= set(config)
+
+
+def check_result(run_dir: Path, script, env_id: str, total: int):
+    result = read_json(run_dir / "result.json")
+    refines = script is refineppo_continuous
+    expected = {"env_id": env_id, "exp_name": script.__name__, "seed": 1, "total_timesteps": total, "std_ddof": 1}
+    expected |= {"refinement_depth": 4 if refines else None, "refinement_schedule": "average" if refines else None}
+    assert {key: result.pop(key) for key in expected} == expected
+    assert set(result) == {"best", "last", "train_return_last10pct", "wall_time_s", "sps"}
+    assert set(result["last"]) == {"global_step", "returns", "mean", "std"}
+    assert set(result["best"]) == {"global_step", "returns", "mean", "std", "selection_return"}
+    for final in (result["best"], result["last"]):
+        assert final["global_step"] == total and isinstance(final["global_step"], int)
+        (only,) = final["returns"]
+        assert isinstance(only, float) and final["mean"] == only and final["std"] == 0
+    assert isinstance(result["best"]["selection_return"], float)
+    assert result["train_return_last10pct"] is None or isinstance(result["train_return_last10pct"], float)
+    assert result["wall_time_s"] > 0 and result["sps"] > 0
+    return result
+
+
+def check_evaluations(run_dir: Path, total: int, selection_return: float):
+    header, *rows = csv.reader((run_dir / "evaluations.csv").read_text().splitlines())
+    assert header == ["global_step", "return_mean", "return_std", "return_min", "return_max", "length_mean"]
+    (row,) = rows
+    step, mean, std, low, high, length = map(float, row)
+    assert row[0] == str(total) and mean == low == high == selection_return and std == 0 and length >= 1
+
+
+def check_tensorboard(run_dir: Path, script):
+    events = read_events(run_dir)
+    scalars = set(events.Tags()["scalars"])
+    assert scalars >= CHARTS | EVALUATION
+    assert {tag for tag in scalars if tag.startswith("losses/")} == {f"losses/{name}" for name in LOSSES.split()}
+    refinement = {tag for tag in scalars if tag.startswith("refinement/")}
+    assert refinement == (REFINEMENT if script is refineppo_continuous else set())
+    (table,) = events.Tensors("hyperparameters/text_summary")
+    _, _, *lines = table.tensor_proto.string_val[0].decode().splitlines()
+    assert {line.split("|")[1] for line in lines} == {field.name for field in fields(script.Args)}
+    start = events.PluginTagToContent("hparams")["_hparams_/session_start_info"]
+    hparams = HParamsPluginData.FromString(start).session_start_info.hparams
+    assert set(hparams) == {field.name for field in fields(script.Args)}
+    assert hparams["learning_rate"].number_value == 3e-4
+    experiment = HParamsPluginData.FromString(events.PluginTagToContent("hparams")["_hparams_/experiment"]).experiment
+    metrics = {info.name.tag for info in experiment.metric_infos}
+    assert metrics and metrics <= scalars
+
+
+def check_checkpoint(path: Path, script, env_id: str, total: int):
+    assert torch.serialization.get_unsafe_globals_in_checkpoint(path) == []
+    checkpoint = torch.load(path, weights_only=True)
+    assert checkpoint["global_step"] == total and checkpoint["args"]["env_id"] == env_id
+    script.Args(**checkpoint["args"])
+
+
+TASKS_AND_ENVS = [(task, 1 + 2 * (i % 2)) for i, task in enumerate([*TASKS, "probe_envs:Unbounded-v0"])]
+
+
+@pytest.mark.parametrize("env_id, num_envs", TASKS_AND_ENVS)
+def test_every_task_trains_and_leaves_all_files(script, env_id, num_envs, tmp_path):
+    total, run_dir = 64 * num_envs, tmp_path / "a" / "run"
+    flags = ("--env-id", env_id, "--num-envs", num_envs, "--total-timesteps", total, "--run-dir", run_dir)
+    done = run(f"{script.__name__}.py", *QUICK, *flags, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert f"tensorboard --logdir {run_dir}" in done.stdout.splitlines()[-1]
+    assert {path.name for path in tmp_path.iterdir()} == {"a"}
+    check_files(run_dir)
+    check_config(run_dir, script, env_id)
+    result = check_result(run_dir, script, env_id, total)
+    check_evaluations(run_dir, total, result["best"]["selection_return"])
+    check_tensorboard(run_dir, script)
+    for name in ("best.pt", "last.pt"):
+        check_checkpoint(run_dir / name, script, env_id, total)
+
+
+def test_help_explains_every_flag(script):
+    shown = run(f"{script.__name__}.py", "--help", COLUMNS="160")
+    assert shown.returncode == 0 and shown.stderr == ""
+
+    def words(text: str) -> str:
+        return " ".join(re.sub("[│,]", " ", text).split())
+
+    body = ast.parse(inspect.getsource(script.Args)).body[0].body
+    docstrings = {flag.target.id: after.value.value for flag, after in zip(body, body[1:]) if hasattr(flag, "target")}
+    assert set(docstrings) == {field.name for field in fields(script.Args)}
+    for name, docstring in docstrings.items():
+        _, flag, explained = words(shown.stdout).partition(f" --{name.replace('_', '-')} ")
+        assert flag and words(docstring) in explained, name
+
+
+def test_flags_are_cleanrls_with_its_defaults(script):
+    cleanrl = {
+        "exp_name": script.__name__, "seed": 1, "torch_deterministic": True, "track": False, "wandb_entity": None,
+        "capture_video": False, "learning_rate": 3e-4, "num_envs": 1, "num_steps": 2048, "anneal_lr": True,
+        "gamma": 0.99, "gae_lambda": 0.95, "num_minibatches": 32, "update_epochs": 10, "norm_adv": True,
+        "clip_coef": 0.2, "clip_vloss": True, "ent_coef": 0.0, "vf_coef": 0.5, "max_grad_norm": 0.5, "target_kl": None,
+    }  # fmt: skip
+    own = {
+        "total_timesteps": 6_000_000, "actor_hidden": (128, 128), "critic_hidden": (64, 64), "log_std_init": 0.0,
+        "eval_interval": 100_000, "eval_episodes": 10, "final_eval_episodes": 10, "evaluate": None, "render": False,
+        "run_dir": None, "resume": False, "compile": True, "num_threads": 1, "bootstrap_truncated": False,
+        "normalize_obs": True, "normalize_reward": True, "progress": True, "save_every": None,
+    }  # fmt: skip
+    defaults = {field.name: field.default for field in fields(script.Args)}
+    assert {name: defaults.get(name, "missing") for name in cleanrl | own} == cleanrl | own
+    assert {"cuda", "wandb_project_name", "env_id"} <= set(defaults)  # CleanRL's, with defaults of our own
+    assert not {"save_model", "upload_model", "hf_entity"} & set(defaults)
+
+
+def test_compiled_run(script, tmp_path):
+    done = run(f"{script.__name__}.py", *QUICK, "--compile", "--env-id", "Pendulum-v1", "--run-dir", tmp_path / "run")
+    assert done.returncode == 0, done.stderr
+    check_result(tmp_path / "run", script, "Pendulum-v1", 64)
+    headers = Path(sysconfig.get_paths()["include"], "Python.h").exists()
+    compiled = headers and any(map(shutil.which, ("g++", "c++", "clang++")))
+    assert torch.load(tmp_path / "run" / "last.pt", weights_only=True)["compiled"] == compiled
+    assert ("compilation failed" in done.stdout) == (not compiled)
+
+
+@pytest.mark.parametrize("flag, package", [("--capture-video", "moviepy"), ("--track", "wandb")])
+def test_extras_that_are_missing(script, flag, package, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(script, "find_spec", lambda name: None)
+    with pytest.raises(SystemExit) as stop:
+        call_main(script, *QUICK, "--env-id", "Pendulum-v1", "--run-dir", tmp_path / "run", flag)
+    assert stop.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert package in line and "pip install" in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_episode_tags_and_kept_checkpoints(script, tmp_path):
+    flags = ("--env-id", "probe_envs:Counter-v0", "--total-timesteps", 160, "--save-every", 50)
+    call_main(script, *QUICK, *flags, "--run-dir", tmp_path)
+    assert tags(tmp_path, "charts/") >= CHARTS | EPISODES
+    # iterations end at 32, 64, ..., 160; kept are the first at or after 50, 100 and 150
+    kept = {path.name: path for path in tmp_path.glob("step_*.pt")}
+    assert set(kept) == {"step_64.pt", "step_128.pt", "step_160.pt"}
+    for name, path in kept.items():
+        check_checkpoint(path, script, "probe_envs:Counter-v0", int(re.sub(r"\D", "", name)))
+
+
+def test_progress_prints_a_line_per_evaluation(script, tmp_path, capsys):
+    flags = (*QUICK, "--env-id", "probe_envs:Counter-v0", "--eval-interval", 32)
+    call_main(script, *flags, "--run-dir", tmp_path / "shown")
+    assert capsys.readouterr().out.count("evaluation return") == 2
+    call_main(script, *flags, "--run-dir", tmp_path / "quiet", "--no-progress")
+    assert "evaluation" not in capsys.readouterr().out

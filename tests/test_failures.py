@@ -1,0 +1,420 @@
+"""Clean stops and clear failures: signals, a full disk, damaged files, bad numbers and crashing simulators."""
+
+import ast
+import itertools
+import json
+import multiprocessing
+import os
+import pickle
+import random
+import re
+import resource
+import shlex
+import shutil
+import signal
+import time
+
+import pytest
+import torch
+from conftest import run
+from resume_helpers import SCRIPTS, Run, differences, finish, flags, outcome, send
+
+
+@pytest.fixture(params=SCRIPTS)
+def name(request):
+    """The file name of each of the two training scripts."""
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A function from a script's name and settings to the outcome of a tiny run that nothing interrupted."""
+    outcomes = {}
+
+    def get(name, **settings):
+        key = name, *settings.items()
+        if key not in outcomes:
+            folder = tmp_path_factory.mktemp("whole")
+            finish(name, flags(folder / "run", **settings), folder / "log")
+            outcomes[key] = outcome(folder / "run")
+        return outcomes[key]
+
+    return get
+
+
+def global_step(path) -> int:
+    return torch.load(path, weights_only=True)["global_step"]
+
+
+# --- Signals ----------------------------------------------------------------------------------------------------------
+
+MOMENTS = {  # in which of the script's functions, before which of its lines; the step at which the run then stops
+    "start": (("open_run", 5), None),
+    "rollout": (("collect", 1500), 192),
+    "update": (("learn", 100), 192),
+    "evaluation": (("evaluate", 1000), 128),
+    "checkpoint": (("save_checkpoint", 2), 64),
+    "final evaluation": (("load_checkpoint", 3), 512),
+}
+CASES = [
+    *(("rollout", signum) for signum in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)),
+    ("start", signal.SIGTERM),
+    ("update", signal.SIGINT),
+    ("update", signal.SIGUSR1),
+    ("evaluation", signal.SIGINT),
+    ("evaluation", signal.SIGTERM),
+    ("checkpoint", signal.SIGUSR1),
+    ("final evaluation", signal.SIGINT),
+]
+
+
+@pytest.mark.parametrize("moment, signum", CASES)
+def test_signal_saves_and_stops(name, moment, signum, whole, tmp_path):
+    at, stop = MOMENTS[moment]
+    settings = {"checkpoint_interval": 64 if moment == "checkpoint" else 100_000}
+    words = flags(tmp_path / "run", **settings)
+    stopped = Run(name, words, tmp_path / "log", at=at, action=send(signum))
+    assert stopped.wait() == 75, stopped.output()
+    assert f"stopped by {signum.name}; continue with" in stopped.output() and "Traceback" not in stopped.output()
+    if stop:
+        assert global_step(tmp_path / "run/last.pt") == stop
+    python, script, *printed = shlex.split(stopped.output().splitlines()[-1])
+    assert (python, script) == ("python", stopped.path) and printed == [*map(str, words), "--resume"]
+    finish(name, printed, tmp_path / "log")
+    assert differences(whole(name), outcome(tmp_path / "run")) == []
+
+
+def test_printed_command_continues(name, tmp_path):
+    """Without --run-dir it names the folder that the run has made for itself."""
+
+    def leave():
+        os.chdir(tmp_path)
+
+    stopped = Run(name, flags("x")[2:], tmp_path / "log", at=("prepare_batch", 3), action=send(15), before=leave)
+    assert stopped.wait() == 75, stopped.output()
+    python, *command = shlex.split(stopped.output().splitlines()[-1])
+    (run_dir,) = (tmp_path / "runs").iterdir()
+    assert command[-3:] == ["--run-dir", f"runs/{run_dir.name}", "--resume"]
+    assert run(*command, cwd=tmp_path).returncode == 0
+    assert (run_dir / "result.json").exists()
+
+
+@pytest.mark.parametrize("signals", [(signal.SIGINT, signal.SIGINT), (signal.SIGTERM, signal.SIGINT)])
+@pytest.mark.parametrize("at", [("evaluate", 1000), ("write_atomically", 25), ("update", 150)], ids=lambda at: at[0])
+def test_second_interrupt_stops_at_once(name, at, signals, whole, tmp_path):
+    words = flags(tmp_path / "run", "--resume")
+    stopped = Run(name, words, tmp_path / "log", at=at, action=send(*signals))
+    assert stopped.wait() == -signal.SIGINT and stopped.output() == ""
+    finish(name, words, tmp_path / "log")
+    assert differences(whole(name), outcome(tmp_path / "run")) == []
+
+
+def test_interrupt_while_compiling(name, tmp_path):
+    """Ctrl-C reaches the C++ compiler as well, and its failure must not look like one of the machine."""
+    cache = tmp_path / "cache"
+
+    def isolate():
+        os.setsid()  # Ctrl-C signals a whole process group
+        os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(cache)
+
+    stopped = Run(name, flags(tmp_path / "run", compile=True), tmp_path / "log", before=isolate)
+    stopped.wait_until(lambda: any(cache.rglob("*.cpp")))
+    time.sleep(0.3)
+    os.killpg(stopped.process.pid, signal.SIGINT)
+    assert stopped.wait() == 75, stopped.output()
+    assert "stopped by SIGINT; continue with" in stopped.output()
+    assert not (tmp_path / "run/last.pt").exists()
+
+
+# --- A full disk ------------------------------------------------------------------------------------------------------
+
+
+def limit_files(size: int):
+    """A function that lets no file of this process grow beyond so many bytes."""
+    return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+
+@pytest.mark.parametrize("what", ["checkpoint", "log"])
+def test_full_disk(name, what, whole, tmp_path):
+    """One clear line, a failing exit code, and the checkpoint from before is whole and is continued from."""
+    settings = {"actor_hidden": 64} if what == "checkpoint" else {"total_timesteps": 1536, "checkpoint_interval": 256}
+    run_dir, words = tmp_path / "run", flags(tmp_path / "run", "--resume", **settings)
+    assert Run(name, words, tmp_path / "log", at=("check_rollout", 15)).wait() == -signal.SIGKILL
+    before = (run_dir / "last.pt").read_bytes()
+    size = len(before) if what == "log" else len(before) - 1000
+    full = Run(name, words, tmp_path / "log", before=limit_files(size))
+    assert full.wait() == 1, full.output()
+    assert full.output().splitlines()[-1] == f"{name}: error: File too large; every checkpoint saved before is intact"
+    if what == "checkpoint":
+        assert (run_dir / "last.pt").read_bytes() == before
+    finish(name, words, tmp_path / "log")
+    assert differences(whole(name, **settings), outcome(run_dir)) == []
+
+
+def test_killed_while_saving_in_a_loop(script, tmp_path):
+    """Whenever the kill comes, the file holds one whole checkpoint: all its tensors from the same round."""
+    path, rng = tmp_path / "last.pt", random.Random(0)
+    args = {field: None for field in script.Args.__dataclass_fields__}
+
+    def save(n):
+        tensors = {str(i): torch.full((2000,), n) for i in range(20)}
+        script.save_checkpoint(path, {"args": args, "global_step": n, "params": tensors, "normalizer": {}})
+
+    def save_forever(first):
+        for n in itertools.count(first):
+            save(n)
+
+    save(0)
+    for _ in range(15):
+        before = script.load_checkpoint(path)["global_step"]
+        process = multiprocessing.get_context("fork").Process(target=save_forever, args=(before + 1,))
+        process.start()
+        time.sleep(rng.uniform(0.01, 0.1))
+        process.kill()
+        process.join()
+        state = script.load_checkpoint(path)
+        assert {x.item() for tensor in state["params"].values() for x in tensor.unique()} == {state["global_step"]}
+        assert state["global_step"] >= before
+    assert state["global_step"] > 15
+
+
+def test_leftovers_of_a_kill_are_cleaned_up(name, whole, tmp_path):
+    """Torn temporary files, a torn record at the event file's end, and a report of a failure that is over."""
+    run_dir, words = tmp_path / "run", flags(tmp_path / "run", "--resume")
+    assert Run(name, words, tmp_path / "log", at=("check_rollout", 9)).wait() == -signal.SIGKILL
+    for leftover in ("last.pt.tmp", "best.pt.tmp", "config.json.tmp", "result.json.tmp", "failure.json"):
+        (run_dir / leftover).write_bytes(b"torn")
+    (events,) = run_dir.glob("events*")
+    with open(events, "ab") as file:
+        file.write(events.read_bytes()[:100] + b"\x18\0\0\0")
+    finish(name, words, tmp_path / "log")
+    assert differences(whole(name), outcome(run_dir)) == []
+
+
+# --- Damaged, foreign and malicious checkpoints -----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    """A function from a script's name to the folder of a run that was killed after its third checkpoint."""
+    runs = {}
+
+    def get(name):
+        if name not in runs:
+            runs[name] = tmp_path_factory.mktemp("stopped") / "run"
+            at = "exit_if_stopped", 4
+            assert Run(name, flags(runs[name], "--resume"), runs[name].with_suffix(".log"), at=at).wait() == -9
+        return runs[name]
+
+    return get
+
+
+def is_refused(script, path, capsys) -> bool:
+    """Whether the checkpoint is refused with exit 2 and one sentence; else it is loaded."""
+    try:
+        script.load_checkpoint(path)
+    except SystemExit as stop:
+        sentence = capsys.readouterr().err
+        assert stop.code == 2 and sentence.count("\n") == 1 and str(path) in sentence, sentence
+        return True
+    return False
+
+
+def test_truncated_checkpoints_are_refused(script, stopped, tmp_path, capsys):
+    data, path = (stopped(f"{script.__name__}.py") / "last.pt").read_bytes(), tmp_path / "last.pt"
+    for size in [*range(0, len(data), 499), len(data) - 1]:
+        path.write_bytes(data[:size])
+        assert is_refused(script, path, capsys), f"{size} of {len(data)} bytes"
+
+
+def test_flipped_bits_are_refused_or_harmless(script, stopped, tmp_path, capsys):
+    """What no checksum covers (padding, dates) may flip, if what is loaded is the same to the last bit."""
+    source, path, rng = stopped(f"{script.__name__}.py") / "last.pt", tmp_path / "last.pt", random.Random(0)
+    data, state, refused = source.read_bytes(), pickle.dumps(as_numpy(torch.load(source))), 0
+    for _ in range(400):
+        flipped = bytearray(data)
+        flipped[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+        path.write_bytes(flipped)
+        if is_refused(script, path, capsys):
+            refused += 1
+        else:
+            assert pickle.dumps(as_numpy(script.load_checkpoint(path))) == state
+    assert refused > 200
+
+
+def as_numpy(x):
+    """Nested dicts and lists with arrays in place of tensors."""
+    if isinstance(x, dict):
+        return {key: as_numpy(value) for key, value in x.items()}
+    if isinstance(x, list | tuple):
+        return [as_numpy(value) for value in x]
+    return x.numpy() if isinstance(x, torch.Tensor) else x
+
+
+def test_damaged_checkpoint_is_refused_by_the_command(name, stopped, tmp_path):
+    """With --resume and with --evaluate; the file is left as it is."""
+    shutil.copytree(stopped(name), tmp_path / "run")
+    path = tmp_path / "run/last.pt"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    for damaged in (bytes(data), bytes(data[: len(data) // 2]), b""):
+        path.write_bytes(damaged)
+        for words in (flags(tmp_path / "run", "--resume"), ["--evaluate", path]):
+            refused = Run(name, words, tmp_path / "log")
+            assert refused.wait() == 2, refused.output()
+            assert refused.output() == f"{name}: error: {path} is damaged or not a checkpoint of {name}\n"
+        assert path.read_bytes() == damaged
+
+
+class Malicious:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+@pytest.mark.parametrize("legacy", [False, True], ids=["zip", "pickle"])
+def test_malicious_checkpoint_runs_nothing(legacy, stopped, tmp_path):
+    """In any script that reads checkpoints. That it would run is shown by loading it without care."""
+    state = torch.load(stopped("refineppo_continuous.py") / "best.pt")
+    path, mark = tmp_path / "evil.pt", tmp_path / "ran"
+    torch.save(state | {"params": Malicious(mark)}, path, _use_new_zipfile_serialization=not legacy)
+    torch.load(path, weights_only=False)
+    mark.rmdir()
+    for name, flag in (*((name, "--evaluate") for name in SCRIPTS), ("analysis_refinement.py", "--checkpoint")):
+        refused = Run(name, [flag, path], tmp_path / "log")
+        assert refused.wait() == 2 and not mark.exists(), refused.output()
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize("missing", ["global_step", "params", "normalizer"])
+def test_incomplete_checkpoint_is_refused(name, missing, stopped, tmp_path):
+    state = torch.load(stopped(name) / "best.pt")
+    del state[missing]
+    torch.save(state, tmp_path / "best.pt")
+    refused = Run(name, ["--evaluate", tmp_path / "best.pt"], tmp_path / "log")
+    assert refused.wait() == 2 and refused.output().count("\n") == 1, refused.output()
+
+
+@pytest.mark.parametrize("missing", ["moments", "envs", "rng", "progress", "compiled"])
+def test_checkpoint_without_a_part_cannot_be_resumed(name, missing, stopped, tmp_path):
+    shutil.copytree(stopped(name), tmp_path / "run")
+    state = torch.load(tmp_path / "run/last.pt")
+    del state[missing]
+    torch.save(state, tmp_path / "run/last.pt")
+    refused = Run(name, flags(tmp_path / "run", "--resume"), tmp_path / "log")
+    assert refused.wait() == 2 and refused.output().count("\n") == 1, refused.output()
+
+
+def test_checkpoints_need_no_unsafe_global(name, stopped):
+    for path in stopped(name).glob("*.pt"):
+        assert torch.serialization.get_unsafe_globals_in_checkpoint(path) == []
+        torch.load(path, weights_only=True)
+
+
+# --- Bad numbers and crashes ------------------------------------------------------------------------------------------
+
+FAULTY = {"env_id": "resume_helpers:Faulty-v0", "num_envs": 3, "num_steps": 20, "total_timesteps": 600}
+
+
+def fault(seed: int, step: int, way: str):
+    """A function that lets Faulty-v0 fail at the step of the episode with the seed."""
+
+    def before():
+        os.environ["FAULT"] = f"{seed} {step} {way}"
+
+    return before
+
+
+def failure(run_dir) -> dict:
+    return json.loads((run_dir / "failure.json").read_text())
+
+
+@pytest.mark.parametrize(
+    "way, step, normalize",
+    [
+        ("nan-reward", 23, True),
+        ("inf-reward", 23, False),
+        ("-inf-reward", 40, True),
+        ("nan-obs", 23, True),
+        ("nan-obs", 40, False),
+        ("inf-obs", 40, True),
+        ("inf-obs", 23, False),
+    ],
+)
+def test_bad_number_in_a_rollout(script, way, step, normalize, whole, tmp_path):
+    """Environment 1's second episode is steps 41 to 80 of each environment, of which 61 to 80 are iteration 4."""
+    name, settings = f"{script.__name__}.py", FAULTY | {"normalize_obs": normalize, "normalize_reward": normalize}
+    words = flags(tmp_path / "run", "--resume", **settings)
+    (seed,) = script.episode_seeds(1, 0, 1, 1)
+    failed = Run(name, words, tmp_path / "log", before=fault(seed, step, way))
+    assert failed.wait() == 3, failed.output()
+    facts = failure(tmp_path / "run")
+    assert facts["what"] == "a reward or an observation"
+    assert (facts["global_step"], facts["env"]) == ((40 + step) * 3, 1)
+    number = way.rsplit("-", 1)[0]
+    assert number == facts["reward"] if way.endswith("reward") else number in facts["next_obs"]
+    line = failed.output().splitlines()[-1]
+    assert line.startswith(f"{name}: numerical failure: ") and "'env': 1" in line and "Traceback" not in failed.output()
+    assert global_step(tmp_path / "run/last.pt") == 180
+    finish(name, words, tmp_path / "log")  # the fault is gone
+    assert differences(whole(name, **settings), outcome(tmp_path / "run")) == []
+
+
+def test_crashing_environment(script, whole, tmp_path):
+    """The simulator's own error is shown, and the run can be continued."""
+    name, words = f"{script.__name__}.py", flags(tmp_path / "run", "--resume", **FAULTY)
+    (seed,) = script.episode_seeds(1, 0, 1, 1)
+    crashed = Run(name, words, tmp_path / "log", before=fault(seed, 23, "crash"))
+    assert crashed.wait() == 1, crashed.output()
+    assert "RuntimeError: the simulator crashed" in crashed.output()
+    assert global_step(tmp_path / "run/last.pt") == 180
+    finish(name, words, tmp_path / "log")
+    assert differences(whole(name, **FAULTY), outcome(tmp_path / "run")) == []
+
+
+@pytest.mark.parametrize("final", [False, True])
+def test_bad_number_in_an_evaluation(script, final, tmp_path):
+    name, words = f"{script.__name__}.py", flags(tmp_path / "run", **FAULTY)
+    args = script.Args(eval_episodes=2, final_eval_episodes=2)
+    bad_step = 600 if final else 180
+    seed = script.evaluation_seeds(args, bad_step, final)[1]
+    failed = Run(name, words, tmp_path / "log", before=fault(seed, 7, "nan-reward"))
+    assert failed.wait() == 3, failed.output()
+    facts = failure(tmp_path / "run")
+    assert (facts["what"], facts["global_step"]) == ("an evaluation return", bad_step)
+    assert re.fullmatch(r"\[-?\d+\.\d+, nan\]", facts["returns"])
+    assert not (tmp_path / "run/result.json").exists()
+
+
+BAD_UPDATES = {
+    "losses/value_loss": {"env_id": "resume_helpers:Huge-v0", "normalize_reward": False},
+    "obs.squares": {"env_id": "resume_helpers:Faulty-v0"},
+    "actor.0.weight": {"learning_rate": 1e38},
+}
+
+
+@pytest.mark.parametrize("culprit", BAD_UPDATES)
+def test_bad_number_in_an_update(script, culprit, tmp_path):
+    """A loss, a running statistic and a parameter: each is named, in the iteration in which it appears."""
+    name, words = f"{script.__name__}.py", flags(tmp_path / "run", **BAD_UPDATES[culprit])
+    (seed,) = script.episode_seeds(1, 0, 0, 0)
+    failed = Run(name, words, tmp_path / "log", before=fault(seed, 3, "1e200-obs"))
+    assert failed.wait() == 3, failed.output()
+    facts = failure(tmp_path / "run")
+    assert facts["global_step"] == 64 and culprit in facts["not_finite"]
+    assert not (tmp_path / "run/last.pt").exists()
+
+
+def test_mujoco_warnings_are_counted(name, whole, tmp_path):
+    """An unstable simulation resets itself silently; the chart tells, also after a resume."""
+    settings = {"env_id": "resume_helpers:Unstable-v0"}
+    run_dir, words = tmp_path / "run", flags(tmp_path / "run", "--resume", **settings)
+    assert Run(name, words, tmp_path / "log", at=("check_rollout", 7)).wait() == -signal.SIGKILL
+    finish(name, words, tmp_path / "log")
+    found = outcome(run_dir)
+    assert differences(whole(name, **settings), found) == []
+    counts = dict(ast.literal_eval(found["charts/mujoco_warnings"]))
+    assert [step for step, count in counts.items() if count] == [128, 256, 448]  # they hold steps 100, 250 and 400
+    assert set(counts.values()) == {0, 1}
