@@ -22,6 +22,7 @@ import csv
 import io
 import json
 import tempfile
+import zipfile
 from collections.abc import Iterator
 from contextlib import suppress
 from copy import copy
@@ -49,7 +50,7 @@ from tqdm import tqdm
 import refineppo_continuous as refineppo
 from refineppo_continuous import Actor, Agent, layers, mean_and_std, refuse
 
-FOLDS, MIN_EPISODES, SHUFFLES, STARTS = 5, 20, 50, 8
+FOLDS, MIN_EPISODES, SHUFFLES, STARTS = 5, 20, 50, 8  # of a regression, recorded, of early components, per state
 SHUFFLED_FOLDS = KFold(FOLDS, shuffle=True, random_state=0)
 QUANTILES = (0.0, 0.02, 0.1, 0.3, 0.6, 0.9)  # of the corrections' norms: the tolerances of `adaptive`
 
@@ -106,7 +107,7 @@ def load_policy(path: Path) -> Policy:
     """A checkpoint's policy on the CPU, or a refusal."""
     ppo_flags = {field.name for field in fields(refineppo.Args)} - {"refinement_depth", "refinement_schedule"}
     with suppress(Exception):  # load_checkpoint says what is wrong with a file that cannot be read
-        if set(torch.load(path, map_location="cpu", weights_only=True)["args"]) == ppo_flags:
+        if zipfile.is_zipfile(path) and set(torch.load(path, "cpu", weights_only=True)["args"]) == ppo_flags:
             refuse(f"{path} is a checkpoint of PPO, which has no refinement to analyse")
     saved = refineppo.load_checkpoint(path)
     try:
@@ -133,7 +134,8 @@ def component_names(env_id: str) -> list[str]:
         names = [on_joint[i] and model.joint(model.actuator_trnid[i, 0]).name or model.actuator(i).name
                  for i in range(model.nu)]  # fmt: skip
     env.close()
-    return [name and (name if names.count(name) == 1 else f"{name} (a{i})") or f"a{i}" for i, name in enumerate(names)]
+    names = [name or f"a{i}" for i, name in enumerate(names)]
+    return [name if names.count(name) == 1 else f"{name} (a{i})" for i, name in enumerate(names)]
 
 
 def check(args: Args) -> list[Policy]:
@@ -674,9 +676,9 @@ class Figures:
         figure, (axis,) = self.axes("Return if refinement stops at a small correction", 1, 1, 3.4, 2.4)
         self.returns(axis, tables["adaptive"], "steps_mean", "stopped below a tolerance")
         fixed = [row for row in tables.get("anytime", []) if 1 <= row["steps"] <= self.depth]
-        if fixed:
-            style = {"linestyle": ":", "fillstyle": "none"}
-            self.curve(axis, fixed, "steps", "return_mean", label="the same number in every state", **style)
+        if fixed and (self.single or self.seeds):
+            look = {"label": "the same number in every state", "linestyle": ":", "fillstyle": "none"}
+            self.curve(axis, fixed, "steps", "return_mean", **look)
         tolerance = max(row["tolerance"] for row in tables["adaptive"])
         axis.set_xlabel(f"mean steps used (tolerance from 0 at $K$ to {tolerance:.2g} on the left)")
         self.legend(figure, axis)

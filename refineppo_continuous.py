@@ -16,6 +16,7 @@ minibatch update (loss, gradient, clipping, Adam) is one compiled function.
 
 import errno
 import fcntl
+import gc
 import io
 import json
 import math
@@ -959,6 +960,7 @@ def main():
     bar = tqdm(total=last_step, initial=step, unit=" steps", unit_scale=True, smoothing=0.05,
                disable=None if args.progress else True)  # fmt: skip
     last_return = last_eval = "-"
+    gc.freeze()  # the garbage collector need not look through all of torch again and again
     while step < last_step:
         # Rollout
         start, step_before = time.time(), step
