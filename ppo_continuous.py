@@ -607,12 +607,12 @@ def learn(update_function, agent: Agent, moments, batch: list, rng, learning_rat
     """The epochs over one rollout, after `adam_steps` earlier minibatches: the mean LOSSES and how many there were."""
     args, losses = agent.args, []
     sizes = adam_step_sizes(learning_rate, adam_steps + 1, args.update_epochs * args.num_minibatches)
-    sizes = torch.from_numpy(sizes.astype(np.float32)).to(agent.device)
+    sizes = torch.from_numpy(sizes.astype(np.float32)).to(agent.device).unbind()
     for _ in range(args.update_epochs):
         order = torch.from_numpy(rng.permutation(args.batch_size)).to(agent.device)
         for index in order.split(args.batch_size // args.num_minibatches):
             out = update_function(agent.params, moments, agent.actor, args, batch, index, sizes[len(losses)])
-            losses.append(out.clone())  # a CUDA graph writes its next output to the same place
+            losses.append(out.clone() if args.cuda else out)  # a CUDA graph's next output comes to the same place
         if args.target_kl is not None and losses[-1][LOSSES.index("approx_kl")] > args.target_kl:
             break
     return torch.stack(losses).mean(0).tolist(), len(losses)
