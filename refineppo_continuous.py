@@ -140,7 +140,7 @@ class Args:
     num_threads: int = 1
     """threads of torch; sweeps fill cores with processes instead"""
     torch_deterministic: bool = True
-    """allow only deterministic algorithms"""
+    """allow only deterministic algorithms on the GPU; on the CPU there are no others here"""
     progress: bool = True
     """show a progress bar (on a terminal) and a line per evaluation"""
     track: bool = False
@@ -679,10 +679,10 @@ def compile_update(agent: Agent, moments) -> tuple:
     else:  # C++ calls the kernels; tanh from exp; and on small matrices a bias in the next kernel is faster than addmm
         options = {"cpp_wrapper": True, "cpp.use_decompose_tanh": True, "pattern_matcher": False}
     options["guard_filter_fn"] = torch.compiler.skip_all_guards_unsafe
-    compiled = torch.compile(update, fullgraph=True, dynamic=False, options=options)
     start, before = time.time(), [x.clone() for x in tensors]
     print("compiling the update (up to a minute the first time, seconds from the cache after that) ...", flush=True)
     try:
+        compiled = torch.compile(update, fullgraph=True, dynamic=False, options=options)
         compiled(agent.params, moments, agent.actor, args, batch, index, torch.ones(2, device=agent.device))
     except Exception as error:  # no C++ compiler, no Python headers, ...: whatever it is, training can go on
         print(f"compilation failed, training goes on uncompiled: {first_line(error)}", flush=True)
@@ -784,7 +784,9 @@ def load_checkpoint(path: Path) -> dict:
         if zipfile.ZipFile(path).testzip():  # torch.load looks at no checksum
             raise ValueError
         state = torch.load(path, map_location="cpu", weights_only=True)
-        flags = set(state["args"]) if isinstance(state, dict) else set()
+        flags = set(state["args"])
+        if not state.keys() >= {"global_step", "params", "normalizer"}:
+            raise ValueError
     except Exception:  # torn, foreign or malicious: the zip and pickle readers have many errors for it
         refuse(f"{path} is damaged or not a checkpoint of {SCRIPT}")
     if flags != {field.name for field in fields(Args)}:
@@ -804,6 +806,9 @@ def describe_machine() -> dict:
         "cpu": next((line.split(": ")[1] for line in cpu.splitlines() if "model name" in line), platform.processor()),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }
+
+
+RESUMED = {"moments", "envs", "rng", "progress", "compiled"}  # what last.pt holds beyond the agent
 
 
 def changed_flags(args: dict, others: dict) -> list[str]:
@@ -860,7 +865,7 @@ def open_run(args: Args) -> tuple[Path, dict | None]:
     if old["cpu"] != config["cpu"]:
         print(f"warning: begun on {old['cpu']}; on {config['cpu']} the last bits of its numbers may differ")
     saved = load_checkpoint(run_dir / "last.pt")
-    if changed_flags(saved["args"], asdict(args)) or "moments" not in saved:
+    if changed_flags(saved["args"], asdict(args)) or not saved.keys() >= RESUMED:
         refuse(f"{run_dir / 'last.pt'} is no checkpoint to continue the run in {run_dir} from")
     return run_dir, saved
 
@@ -915,8 +920,9 @@ def main():
     obs_space, action_space = check_args(args)
     limit_threads(args)
     run_dir, saved = open_run(args)
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # without it cuBLAS refuses to be deterministic
-    torch.use_deterministic_algorithms(args.torch_deterministic)
+    if args.cuda:  # on the CPU all that is used here is deterministic
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # without it cuBLAS refuses to be
+        torch.use_deterministic_algorithms(args.torch_deterministic)
 
     # All that training changes, and what an earlier process has saved of it
     agent = Agent(obs_space, action_space, args)
