@@ -44,7 +44,6 @@ from sklearn.linear_model import Ridge
 from sklearn.model_selection import GroupKFold, KFold, cross_val_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
-from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 import refineppo_continuous as refineppo
@@ -725,9 +724,8 @@ def as_png(figure: Figure) -> bytes:
 
 def main():
     args = tyro.cli(Args, description=__doc__)
-    torch.set_num_threads(1)
-    threadpool_limits(1)  # NumPy's
     policies = check(args)
+    refineppo.limit_threads(policies[0].args)  # as in the run, for the same returns
     several, tables = len(policies) > 1, {}
     for policy in tqdm(policies, desc="checkpoints", disable=None if several else True):
         for name, rows in analyse(policy, args).items():
