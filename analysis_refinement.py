@@ -659,6 +659,7 @@ class Figures:
             axis.plot(x["given_observation"], y, "kx", markersize=4.5, label="observation in both models")
             axis.set_yticks(y, x["component"])
             axis.set(ylim=(len(y) - 0.5, -0.5), xlabel=r"$\Delta R^2$")
+            axis.locator_params(axis="x", nbins=3)
             axis.set_title(f"{k}→{k + 1}" if self.single else f"{self.labels[path]}\n{k}→{k + 1}")
         self.legend(figure, axes[0])
         return {"delta_r2": heatmap, "delta_r2_checks": figure}

@@ -110,7 +110,7 @@ class Run:
 
         return trace
 
-    def wait(self, timeout=120) -> int:
+    def wait(self, timeout=300) -> int:
         """The exit code; minus the signal's number if one killed the process."""
         self.process.join(timeout)
         assert self.process.exitcode is not None, f"still running after {timeout} s"
