@@ -741,9 +741,9 @@ def load_checkpoint(path: Path) -> dict:
         if zipfile.ZipFile(path).testzip():  # torch.load looks at no checksum
             raise ValueError
         state = torch.load(path, map_location="cpu", weights_only=True)
-        flags = set(state["args"])
-        if not state.keys() >= {"global_step", "params", "normalizer"}:
+        if not state.keys() >= {"args", "global_step", "params", "normalizer"}:
             raise ValueError
+        flags = set(state["args"])
     except Exception:  # torn, foreign or malicious: the zip and pickle readers have many errors for it
         refuse(f"{path} is damaged or not a checkpoint of {SCRIPT}")
     if flags != {field.name for field in fields(Args)}:
