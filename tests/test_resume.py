@@ -92,7 +92,7 @@ def test_killed_at_the_very_end(name, whole, tmp_path):
 def test_killed_by_the_clock(compiled, tmp_path):
     """SIGKILL soon after a checkpoint was written, whatever the process does then."""
     name, env_id = ("refineppo_continuous.py", "Hopper-v5") if compiled else ("ppo_continuous.py", "BipedalWalker-v3")
-    settings = {"env_id": env_id, "compile": compiled, "total_timesteps": 6400 if compiled else 3200, "eval_interval": 1600}
+    settings = {"env_id": env_id, "compile": compiled, "total_timesteps": 6400, "eval_interval": 1000}
     words, rng, last = flags(tmp_path / "killed", "--resume", **settings), random.Random(0), tmp_path / "killed/last.pt"
     for _ in range(2):
         before = last.stat().st_mtime_ns if last.exists() else 0
