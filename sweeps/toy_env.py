@@ -3,7 +3,7 @@
     reward = -(a_1 - phi(s))^2 - (a_2 - psi(s, phi(s)))^2,   s uniform in [-1, 1]
 
 The right a_2 depends on the right a_1. The paper leaves phi and psi open (section "Why Iterative Action Refinement Can
-Work"); these two are smooth, within the action bounds, and less smooth when composed.
+Work"); these two are smooth and stay within the action bounds.
 """
 
 import gymnasium as gym
@@ -12,12 +12,12 @@ import numpy as np
 
 def phi(s):
     """The right first component."""
-    return np.sin(np.pi * s)
+    return np.sin(2 * s)
 
 
 def psi(s, a_1):
     """The right second component, given the first."""
-    return np.sin(np.pi * (s - a_1))
+    return 2 * s * a_1 - 1
 
 
 class Coordination(gym.Env):
