@@ -1,3 +1,4 @@
+# shellcheck shell=bash
 # Installs and starts what the sweep tests run on, on this machine alone: GNU parallel, a one-node Slurm, PostgreSQL.
 # To be sourced: exports SLURM_CONF and REFINEPPO_TEST_POSTGRES; `stop_engines` ends and removes everything.
 # Needs Debian or Ubuntu and root; everything listens on 127.0.0.1.
