@@ -2,7 +2,8 @@
 
     python sweeps/report.py runs
 
-Reads config.json, evaluations.csv and result.json of every run folder below RUNS_DIR; links are followed. Writes
+Reads config.json, evaluations.csv and result.json of every run folder below RUNS_DIR, but for searches (tune.py); links
+are followed. Writes
 report.md with its figures (PNG, PDF), and each table also as CSV and LaTeX (booktabs). A sweep that is not complete
 reports what is there and says what is missing; folders that cannot be used are named with the reason.
 
@@ -193,6 +194,9 @@ def find_runs(root: Path) -> tuple[list[Run], dict[str, str]]:
             subfolders.clear()
             continue
         seen.add((status.st_dev, status.st_ino))
+        if "trials.csv" in files:
+            skipped[os.path.relpath(path, root)] = "a search by tune.py, which does not report"
+            subfolders.clear()
         subfolders.sort()
         if RUN_FILES & {*files}:
             name = os.path.relpath(path, root)
@@ -834,7 +838,7 @@ def main():
         "Finished runs without evaluations (in tables of final returns alone)": [
             quoted(run) for run in runs if run.scores and not len(run.curve)
         ],
-        "Torn, foreign or unreadable folders (skipped)": [f"`{name}`: {why}" for name, why in skipped.items()],
+        "Torn, foreign or unreadable folders, and searches (skipped)": [f"`{name}`: {why}" for name, why in skipped.items()],
         "Duplicates, and variants of a setting with fewer finished seeds or steps (left out)": left_out,
     }.items():
         report.say(f"{title}: none." if not lines else f"{title}:\n\n" + "\n".join(f"- {line}" for line in lines))

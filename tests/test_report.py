@@ -314,12 +314,15 @@ def test_folders_that_cannot_be_used_are_named_with_the_reason(tmp_path, make_re
         spoil(make_run(tmp_path / "deep/er", name, "Hopper-v5", 9, best=999))
     (tmp_path / "notes").mkdir()  # no run and none of its files
     (tmp_path / "notes/x.txt").touch()
+    make_run(tmp_path / "tune/study/trial_0", "seed_1001", "Hopper-v5", 1001, best=999)
+    (tmp_path / "tune/study/trials.csv").touch()
     lines = section(make_report(tmp_path), "What is missing").splitlines()
     for name, (_, reason) in BAD_FOLDERS.items():
         (line,) = [line for line in lines if line.startswith(f"- `deep/er/{name}`: ")]
         assert reason in line
     assert table((tmp_path / "report/report.md").read_text(), "Table 1")["Hopper-v5"][1] == "15.0 ± 7.1"
-    assert f"2 finished, 0 unfinished, {len(BAD_FOLDERS)} skipped" in capsys.readouterr().out
+    assert f"2 finished, 0 unfinished, {len(BAD_FOLDERS) + 1} skipped" in capsys.readouterr().out
+    assert any(line.startswith("- `tune/study`: a search") for line in lines)
     assert not any("notes" in line for line in lines)
 
 
