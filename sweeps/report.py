@@ -3,9 +3,8 @@
     python sweeps/report.py runs
 
 Reads config.json, evaluations.csv and result.json of every run folder below RUNS_DIR, but for searches (tune.py); links
-are followed. Writes
-report.md with its figures (PNG, PDF), and each table also as CSV and LaTeX (booktabs). A sweep that is not complete
-reports what is there and says what is missing; folders that cannot be used are named with the reason.
+are followed. Writes report.md with its figures (PNG, PDF), and each table also as CSV and LaTeX (booktabs). A sweep that
+is not complete reports what is there and says what is missing; folders that cannot be used are named with the reason.
 
 All seeds of a setting (task, K, schedule) share all other flags. Of several variants of a setting the one with the
 most finished seeds counts, then the one with the most steps; the others are named. RefinePPO in Table 1 has the K and
