@@ -6,7 +6,8 @@
 
 What becomes of a job follows from its exit code: 0 done; 2 (bad arguments) and 3 (a number was not finite) failed for
 good; anything else (75, stopped from outside; a crash) is tried again, three times in all. TERM, INT, HUP and USR1 are
-passed on to the training as TERM: it saves and ends with 75, and so does this. Every attempt's row goes to joblog.tsv.
+passed on to the training as TERM: it saves and ends with 75, and so does this. Every attempt has a row in joblog.tsv,
+beside the log.
 """
 
 import os
@@ -56,7 +57,7 @@ def attempt(line: str, log: Path) -> int:
     child = None
     code = 128 - code if code < 0 else code
     row = datetime.fromtimestamp(start).isoformat(" ", "seconds"), f"{time.time() - start:.1f}", code
-    append(RUNS_DIR / "joblog.tsv", *row, socket.gethostname(), line, header="started seconds exit host command")
+    append(log.with_name("joblog.tsv"), *row, socket.gethostname(), line, header="started seconds exit host command")
     return code
 
 

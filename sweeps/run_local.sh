@@ -4,7 +4,7 @@
 #     sweeps/depth.sh HalfCheetah-v5 | sweeps/run_local.sh [-j N] [--dry-run] [FILE]
 #
 # Jobs come from standard input or from FILE, a command a line; one that stands there twice is run once. N is the number
-# of cores if not given. Each job's output goes to <run folder>.log, a row per attempt to $RUNS_DIR/joblog.tsv. Jobs that
+# of cores if not given. Each job's output goes to <run folder>.log, a row per attempt to joblog.tsv beside it. Jobs that
 # were stopped or crashed are tried again, those that failed for good are not (see jobs.py). Ctrl-C lets every training
 # save; the same command continues. Exit code: 0 all done, 1 some failed, 75 some left, 2 bad arguments.
 

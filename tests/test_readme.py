@@ -1,8 +1,12 @@
-"""Every command and every Python snippet of the README is run, in the README's order, with fewer steps."""
+"""Every command and every Python snippet of the README is run, in the README's order, with fewer steps.
+
+Of a sweep the generator runs as it stands, and the executor only says what it would run: test_sweeps.py has the rest.
+"""
 
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -16,6 +20,7 @@ from test_commands import QUICK
 import analysis_refinement
 import ppo_continuous
 import refineppo_continuous
+from sweeps import report, tune
 
 SCRIPTS = {f"{module.__name__}.py": module for module in (ppo_continuous, refineppo_continuous)}
 
@@ -27,6 +32,12 @@ def readme() -> str:
 def blocks(text: str) -> list[tuple[str, str]]:
     """The (language, content) of every fenced block."""
     return re.findall(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+
+
+def table_commands(text: str) -> list[str]:
+    """The commands in the cells of tables, where | is written \\|."""
+    cells = re.findall(r"(?<=\| )`((?:python |sweeps/)[^`]+)`(?= \|)", text)
+    return [cell.replace(r"\|", "|") for cell in cells]
 
 
 def commands(block: str) -> list[list[str]]:
@@ -70,9 +81,29 @@ def run_command(words: list[str], folder: Path):
             train_or_evaluate(name, "--env-id", "LunarLanderContinuous-v3", "--run-dir", "lander", folder=folder)
             window = {"SDL_VIDEODRIVER": "dummy"}
             train_or_evaluate(name, "--evaluate", "lander/best.pt", "--render", folder=folder, **window)
+        case [*_] if "|" in words and words[words.index("|") + 1] in ("sweeps/run_local.sh", "sweeps/run_slurm.sh"):
+            cut = words.index("|")
+            chosen = dict(word.split("=") for word in words[:cut] if "=" in word)
+            generator, (executor, *flags) = words[len(chosen) : cut], words[cut + 1 :]
+            jobs = subprocess.run(generator, cwd=ROOT, env=os.environ | chosen, capture_output=True, text=True)
+            planned = subprocess.run([executor, "--dry-run", *flags], cwd=ROOT, input=jobs.stdout,
+                                     capture_output=True, text=True)  # fmt: skip
+            assert (jobs.returncode, planned.returncode) == (0, 0), jobs.stderr + planned.stderr
+            assert jobs.stdout.count("_continuous.py --env-id") == planned.stdout.count("_continuous.py --env-id") > 0
+        case ["python", "sweeps/tune.py", *flags]:
+            searched = run("sweeps/tune.py", *flags, "--dry-run", "--flags=--no-compile", cwd=folder)
+            assert searched.returncode == 0, searched.stdout + searched.stderr
+        case ["python", "sweeps/report.py", *flags]:
+            reported = run("sweeps/report.py", *flags, cwd=folder)
+            assert reported.returncode == 0 and "report.md" in reported.stdout, reported.stdout + reported.stderr
         case ["python", name, *flags] if name in SCRIPTS and not {"|", ">", ";", "&"} & set(flags):
             train_or_evaluate(name, *flags, folder=folder)
-        case ["python", "analysis_refinement.py", *flags]:
+        case ["python", "analysis_refinement.py", "--checkpoint", pattern, *flags]:
+            if "*" in pattern:  # the shell would find the runs of a sweep
+                name = pattern.split("/")[1].replace("*", "__")
+                shutil.copytree(folder / "runs" / "hopper", folder / "runs" / name)
+                (pattern,) = folder.glob(pattern)
+            flags = "--checkpoint", pattern, *flags
             analysed = run("analysis_refinement.py", *flags, "--num-states", 100, "--episodes", 2, cwd=folder)
             assert analysed.returncode == 0, analysed.stdout + analysed.stderr
         case _:
@@ -88,7 +119,10 @@ def test_every_command_and_snippet(tmp_path):
         for words in commands(content) if language in ("bash", "sh", "console") else []:
             run_command(words, tmp_path)
             ran.append(words[0])
-    assert {"pip", "python", "pytest", "tensorboard", "snippet"} <= set(ran)
+    for command in table_commands(readme()):
+        run_command(shlex.split(command), tmp_path)
+        ran.append(command.split("/")[-1].split()[0])
+    assert {"pip", "python", "pytest", "tensorboard", "snippet", "run_local.sh", "tune.py", "report.py"} <= set(ran)
 
 
 def test_commands_are_found_and_unknown_ones_fail(tmp_path):
@@ -102,8 +136,9 @@ def test_commands_are_found_and_unknown_ones_fail(tmp_path):
 
 
 def test_every_flag_that_is_named_exists():
-    modules = *SCRIPTS.values(), analysis_refinement
+    modules = *SCRIPTS.values(), analysis_refinement, tune, report
     flags = {field.name.replace("_", "-") for module in modules for field in fields(module.Args)}
     known = {f"--{prefix}{name}" for name in flags for prefix in ("", "no-")} | {"--help", "--logdir"}
+    known |= {"--max-running", "--time", "--partition"}  # of run_slurm.sh and sbatch
     named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", readme()))
     assert named - known == set() and len(named) > 10
