@@ -7,6 +7,11 @@ engines=$(mktemp -d)
 chmod 755 "$engines"
 
 stop_engines() {
+    scancel --user=root || true
+    for _ in $(seq 20); do
+        if [ -z "$(squeue --noheader)" ]; then break; fi
+        sleep 1
+    done
     for name in slurmd slurmctld munged; do
         if [ -f "$engines/$name.pid" ]; then kill "$(cat "$engines/$name.pid")" || true; fi
     done

@@ -14,6 +14,7 @@ root=$(dirname "$here")
 SEEDS=${SEEDS:-1 2 3 4 5}
 STEPS=${STEPS:-6000000}
 RUNS_DIR=${RUNS_DIR:-runs}
+RUNS_DIR=${RUNS_DIR%/}
 SETTINGS=${SETTINGS:-$here/settings}
 
 mujoco="Ant-v5 HalfCheetah-v5 Hopper-v5 Walker2d-v5 Swimmer-v5 Pusher-v5 Reacher-v5 HumanoidStandup-v5 Humanoid-v5"
@@ -27,21 +28,26 @@ refuse() {
 
 # parse_tasks DEFAULT [ARGUMENT...]: sets `tasks` to a generator's arguments, or to the default, and checks all input
 parse_tasks() {
-    local word
+    local word algorithm
     tasks=${*:2}
     tasks=${tasks:-$1}
     for word in "${@:2}"; do
         case $word in
-            -h | --help) sed -n '2,/^$/s/^#\( \|$\)//p' "$0"; exit 0 ;;
+            -h | --help) sed -nE '2,/^$/s/^#( |$)//p' "$0"; exit 0 ;;
             -* | '' | *[[:space:]]*) refuse "$word is no task; the arguments are tasks, such as Hopper-v5" ;;
         esac
     done
     for word in $SEEDS; do
-        case $word in *[!0-9]*) refuse "SEEDS must be whole numbers with spaces between, not '$SEEDS'" ;; esac
+        case $word in *[!0-9]* | 0?*) refuse "SEEDS must be whole numbers with spaces between, not '$SEEDS'" ;; esac
     done
     [ -n "${SEEDS// /}" ] || refuse "SEEDS is empty"
-    case $STEPS in *[!0-9]* | 0) refuse "STEPS must be a whole number, not '$STEPS'" ;; esac
+    case $STEPS in *[!0-9]* | 0*) refuse "STEPS must be a whole number, not '$STEPS'" ;; esac
     [ "$SETTINGS" = none ] || [ -d "$SETTINGS" ] || refuse "there is no settings folder $SETTINGS"
+    for word in $tasks; do
+        for algorithm in ppo refineppo; do
+            read_settings "$algorithm" "$word" # refuses before the first command is printed
+        done
+    done
 }
 
 # read_settings ALGORITHM TASK: sets `flags`, and `depth` and `schedule`, which stand apart since sweeps vary them
@@ -49,9 +55,15 @@ read_settings() {
     local file=$SETTINGS/$1/${2//\//_}.args words=() i
     flags='' depth=4 schedule=average
     [ "$SETTINGS" != none ] && [ -f "$file" ] || return 0
-    IFS=$' \t\n' read -r -d '' -a words < <(sed 's/#.*//' "$file") || true
+    IFS=$' \t\r\n' read -r -d '' -a words < <(sed 's/#.*//' "$file") || true
     for ((i = 0; i < ${#words[@]}; i++)); do
         case ${words[i]} in
+            --refinement-depth | --refinement-schedule)
+                [ $((i + 1)) -lt ${#words[@]} ] || refuse "$file: ${words[i]} lacks its value" ;;
+        esac
+        case ${words[i]} in
+            --*[=_]*) refuse "$file: write ${words[i]} with dashes and a blank, as in --num-envs 4" ;;
+            --env-id | --seed | --total-timesteps | --run-dir) refuse "$file: ${words[i]} is the sweep's own" ;;
             --refinement-depth) depth=${words[++i]} ;;
             --refinement-schedule) schedule=${words[++i]} ;;
             *) flags+=" ${words[i]}" ;;

@@ -10,6 +10,7 @@ passed on to the training as TERM: it saves and ends with 75, and so does this. 
 beside the log.
 """
 
+import ctypes
 import os
 import shlex
 import signal
@@ -18,6 +19,7 @@ import subprocess
 import sys
 import time
 import zlib
+from contextlib import suppress
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -32,30 +34,41 @@ signals, child = [], None  # received by this process; the attempt that is runni
 def pass_on(signum, _):
     signals.append(signum)
     if child:
-        os.killpg(child.pid, signal.SIGTERM)
+        with suppress(ProcessLookupError, PermissionError):  # it has just ended
+            os.killpg(child.pid, signal.SIGTERM)
+
+
+def die_with_parent():
+    """Have the kernel stop the training, which then saves, if this process is killed."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 
 
 def log_of(line: str) -> Path:
     """The log of a job: beside its run folder, or named after the line where that has no --run-dir."""
     try:
         words = shlex.split(line)
-        return Path(words[words.index("--run-dir") + 1] + ".log")
+        run_dir = Path(words[words.index("--run-dir") + 1])
+        return run_dir.with_name(run_dir.name + ".log")
     except (ValueError, IndexError):
         return RUNS_DIR / f"job-{zlib.crc32(line.encode()):08x}.log"
 
 
 def attempt(line: str, log: Path) -> int:
-    """Run the line once; its exit code, 128 + n after signal n."""
+    """Run the line once; its exit code, 128 + n after signal n, 75 if another process has the run folder."""
     global child
     start = time.time()
     with open(log, "ab") as out:  # a process group of its own: the terminal's Ctrl-C must not reach it twice
+        before = out.tell()
         child = subprocess.Popen(["bash", "-c", line], stdin=subprocess.DEVNULL, stdout=out, stderr=out,
-                                 env=os.environ | ONE_THREAD, process_group=0)  # fmt: skip
+                                 env=os.environ | ONE_THREAD, process_group=0, preexec_fn=die_with_parent)  # fmt: skip
         if signals:  # one came before `child` was known
             pass_on(signals[0], None)
         code = child.wait()
     child = None
     code = 128 - code if code < 0 else code
+    if code == 2 and b"another process is at work" in log.read_bytes()[before:]:
+        code = STOPPED
     row = datetime.fromtimestamp(start).isoformat(" ", "seconds"), f"{time.time() - start:.1f}", code
     append(log.with_name("joblog.tsv"), *row, socket.gethostname(), line, header="started seconds exit host command")
     return code
@@ -64,8 +77,9 @@ def attempt(line: str, log: Path) -> int:
 def append(path: Path, *row, header: str = ""):
     """Add a row of tab-separated values in one write, so that rows of several processes do not mix."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    if header and not path.exists():
-        append(path, *header.split())
+    if header:
+        with suppress(FileExistsError), open(path, "x") as file:
+            file.write("\t".join(header.split()) + "\n")
     with open(path, "a") as file:
         file.write("\t".join(map(str, row)) + "\n")
 
@@ -73,13 +87,18 @@ def append(path: Path, *row, header: str = ""):
 def run(line: str) -> tuple[int, Path]:
     """Run a job to its end or its last attempt: its exit code, 75 if this process was told to stop, and its log."""
     log = log_of(line)
-    log.parent.mkdir(parents=True, exist_ok=True)
-    for _ in range(ATTEMPTS):
-        if signals:
-            return STOPPED, log
-        code = attempt(line, log)
-        if code in FOR_GOOD:
-            break
+    try:
+        log.parent.mkdir(parents=True, exist_ok=True)
+        for n in range(ATTEMPTS):
+            time.sleep(2 * n)  # a killed executor's training may still be saving
+            if signals:
+                return STOPPED, log
+            code = attempt(line, log)
+            if code in FOR_GOOD:
+                break
+    except OSError as error:
+        print(f"{error.filename}: {error.strerror}", file=sys.stderr)
+        return CRASHED, log
     return STOPPED if signals and code not in FOR_GOOD else code, log
 
 

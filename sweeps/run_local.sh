@@ -16,10 +16,10 @@ refuse() {
     exit 2
 }
 
-n=$(getconf _NPROCESSORS_ONLN) dry_run='' file=-
+n=$(nproc 2>/dev/null || getconf _NPROCESSORS_ONLN) dry_run='' file=-
 while [ $# -gt 0 ]; do
     case $1 in
-        -h | --help) sed -n '2,/^$/s/^#\( \|$\)//p' "$0"; exit 0 ;;
+        -h | --help) sed -nE '2,/^$/s/^#( |$)//p' "$0"; exit 0 ;;
         -j) n=${2:-}; shift ;;
         -j*) n=${1#-j} ;;
         --dry-run) dry_run=1 ;;
@@ -28,14 +28,15 @@ while [ $# -gt 0 ]; do
     esac
     shift || true
 done
-case $n in '' | *[!0-9]* | 0) refuse "-j must be a whole number of at least 1, not '$n'" ;; esac
+case $n in '' | *[!0-9]* | 0*) refuse "-j must be a whole number of at least 1, not '$n'" ;; esac
 [ "$file" = - ] || [ -f "$file" ] || refuse "there is no file $file"
 [ "$file" != - ] || [ ! -t 0 ] || refuse "no jobs: pipe a generator's output into this, or name a file"
+[ "$file" = - ] || exec <"$file"
 
 SWEEP_DIR=$(mktemp -d)
 export SWEEP_DIR
 trap 'rm -rf "$SWEEP_DIR"' EXIT
-awk 'NF && !/^ *#/ && !seen[$0]++' "$file" >"$SWEEP_DIR/jobs"
+awk 'NF && $1 !~ /^#/ && !seen[$0]++' >"$SWEEP_DIR/jobs"
 [ -s "$SWEEP_DIR/jobs" ] || refuse "no jobs"
 if [ "$dry_run" ]; then
     cat "$SWEEP_DIR/jobs"
@@ -57,9 +58,10 @@ trap stop INT TERM HUP USR1
 echo "$(wc -l <"$SWEEP_DIR/jobs") jobs, $n at a time" >&2
 set -m # the jobs get a process group of their own, which the terminal's Ctrl-C does not reach
 if parallel --version 2>/dev/null | grep -q '^GNU parallel'; then # moreutils has a command of this name too
-    parallel --will-cite --ungroup -j "$n" -a "$SWEEP_DIR/jobs" python "$here/jobs.py" one </dev/null &
+    parallel --will-cite --quote --ungroup -j "$n" -a "$SWEEP_DIR/jobs" python "$here/jobs.py" one </dev/null &
 else
-    tr '\n' '\0' <"$SWEEP_DIR/jobs" | xargs -0 -n 1 -P "$n" python "$here/jobs.py" one &
+    # shellcheck disable=SC2016  # for the inner shell; a job that is killed must not end the others
+    tr '\n' '\0' <"$SWEEP_DIR/jobs" | xargs -0 -n 1 -P "$n" sh -c 'python "$0" one "$1" || true' "$here/jobs.py" &
 fi
 until wait $!; do # a signal interrupts `wait`
     kill -0 $! 2>/dev/null || break

@@ -6,8 +6,8 @@
 #
 # Jobs come from standard input or from FILE, a command a line; one that stands there twice is run once. Short ones share
 # a task of the array, until it has --steps-per-task environment steps (1000000). At most --max-running tasks run at once.
-# Five minutes before the time limit a task's training saves, and the task goes back to the queue; so does a preempted one.
-# Flags after -- go to sbatch and win over ours. Output: <run folder>.log of each job, $RUNS_DIR/slurm/ for the tasks.
+# Five minutes before the time limit, which must be well above that, a task's training saves, and the task goes back to the
+# queue; so does a preempted one. Flags after -- go to sbatch and win over ours. Output: <run folder>.log of each job, $RUNS_DIR/slurm/ for the tasks.
 
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
@@ -21,7 +21,7 @@ refuse() {
 max_running='' steps_per_task=1000000 dry_run='' file=-
 while [ $# -gt 0 ]; do
     case $1 in
-        -h | --help) sed -n '2,/^$/s/^#\( \|$\)//p' "$0"; exit 0 ;;
+        -h | --help) sed -nE '2,/^$/s/^#( |$)//p' "$0"; exit 0 ;;
         --max-running) max_running=${2:-none}; shift ;;
         --steps-per-task) steps_per_task=${2:-none}; shift ;;
         --dry-run) dry_run=1 ;;
@@ -31,21 +31,22 @@ while [ $# -gt 0 ]; do
     esac
     shift || true
 done
-case $max_running in *[!0-9]* | 0) refuse "--max-running must be a whole number of at least 1, not '$max_running'" ;; esac
+case $max_running in *[!0-9]* | 0*) refuse "--max-running must be a whole number of at least 1, not '$max_running'" ;; esac
 case $steps_per_task in *[!0-9]*) refuse "--steps-per-task must be a whole number, not '$steps_per_task'" ;; esac
 [ "$file" = - ] || [ -f "$file" ] || refuse "there is no file $file"
 [ "$file" != - ] || [ ! -t 0 ] || refuse "no jobs: pipe a generator's output into this, or name a file"
+[ "$file" = - ] || exec <"$file"
 [ "$dry_run" ] || command -v sbatch >/dev/null || refuse "there is no sbatch on this machine"
 
 # "<task of the array> <tab> <command>"; a job without --total-timesteps has a task of its own
 list=$(awk -v most="$steps_per_task" '
-    !NF || /^ *#/ || seen[$0]++ { next }
+    !NF || $1 ~ /^#/ || seen[$0]++ { next }
     {
         steps = match($0, /--total-timesteps +[0-9]+/) ? substr($0, RSTART + 18, RLENGTH - 18) + 0 : most
         if (!task || sum + steps > most) { task++; sum = 0 }
         sum += steps
         print task "\t" $0
-    }' "$file")
+    }')
 [ "$list" ] || refuse "no jobs"
 tasks=$(tail -n 1 <<<"$list" | cut -f 1)
 path=$RUNS_DIR/slurm/$(date +%Y%m%d-%H%M%S)-$$.tsv

@@ -29,12 +29,12 @@ class Coordination(gym.Env):
     def reset(self, seed=None, options=None):
         super().reset(seed=seed)
         self.s = self.np_random.uniform(-1, 1, 1).astype(np.float32)
-        return self.s, {}
+        return self.s.copy(), {}
 
     def step(self, action):
         a_1 = phi(self.s[0])
         reward = -((action[0] - a_1) ** 2) - (action[1] - psi(self.s[0], a_1)) ** 2
-        return self.s, float(reward), True, False, {}
+        return self.s.copy(), float(reward), True, False, {}
 
 
-gym.register("Coordination-v0", Coordination, max_episode_steps=1)
+gym.register("Coordination-v0", Coordination, max_episode_steps=2)  # it has a time limit, and never meets it

@@ -13,8 +13,9 @@ space below, and learns from those two by the points of the space that are neare
 RefinePPO's depth and schedule are searched within the same number of trials, or fixed by two flags. Trials that fail
 (no episode ended, numbers not finite, two crashes) count too.
 
-Leaves in --out-dir the runs as <study>/trial_<number>/seed_<seed>, every trial in <study>/trials.csv, and the winner
-as settings/<algorithm>/<task>.args (settings-K4-average/... if the depth was fixed so), for the job generators:
+Leaves in --out-dir the runs as <study>/trial_<number>/seed_<seed>, every trial in <study>/trials.csv, and the winner as
+settings/<algorithm>/<task>.args (settings-K4-average/... if the depth was fixed so, settings-<study>/... if the study
+has a name of its own), for the job generators and the report:
 
     SETTINGS=runs/tune/settings sweeps/benchmark.sh Hopper-v5 | sweeps/run_local.sh -j 8
 """
@@ -337,7 +338,8 @@ class Worker:
         task = args.env_id.replace("/", "_")
         self.name = args.study_name or f"{task}__{args.algorithm}{arm}"
         self.folder = args.out_dir / self.name
-        self.winner_file = args.out_dir / f"settings{arm}" / args.algorithm / f"{task}.args"
+        of = f"-{args.study_name}" if args.study_name else arm
+        self.winner_file = args.out_dir / f"settings{of}" / args.algorithm / f"{task}.args"
 
     def check(self):
         """Refuse what cannot be searched before any work starts."""
@@ -664,6 +666,7 @@ def main(args: Args):
         if done < args.trials:
             worker.state_budget(done)
             worker.open_study(storage)
+            worker.write_files(worker.study.get_trials())
             worker.search()
             if worker.signals:
                 worker.put_back()

@@ -137,11 +137,27 @@ def test_settings_that_come_with_the_repository_are_understood(tmp_path):
         assert parse(line).env_id in TASKS
 
 
+@pytest.mark.parametrize("text, names", [
+    ("--num-envs=4", "--num-envs=4"),
+    ("--gamma 0.9 --refinement_depth 2", "--refinement_depth"),
+    ("--refinement-schedule uniform\n--refinement-depth # 2", "--refinement-depth"),
+    ("--seed 7", "--seed"),
+    ("--total-timesteps 1000", "--total-timesteps"),
+])  # fmt: skip
+def test_settings_that_would_mislead_are_refused(text, names, tmp_path):
+    (tmp_path / "tuned" / "refineppo").mkdir(parents=True)
+    (tmp_path / "tuned" / "refineppo" / "Hopper-v5.args").write_text(text)
+    done = shell(tmp_path, "benchmark.sh", "Ant-v5", "Hopper-v5", SETTINGS="tuned")
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert names in done.stderr and "refineppo/Hopper-v5.args" in done.stderr
+
+
 @pytest.mark.parametrize("words, settings, names", [
     (["--depth"], {}, "--depth"),
     ([], {"SEEDS": "1 two"}, "SEEDS"),
     ([], {"SEEDS": "1,2"}, "SEEDS"),
     ([], {"SEEDS": " "}, "SEEDS"),
+    ([], {"SEEDS": "1 01"}, "SEEDS"),
     ([], {"STEPS": "6e6"}, "STEPS"),
     ([], {"SETTINGS": "no/such"}, "no/such"),
 ])  # fmt: skip
@@ -220,6 +236,33 @@ def test_each_job_has_one_thread_and_its_own_log(engine, tmp_path):
     line = "echo $OMP_NUM_THREADS$MKL_NUM_THREADS$OPENBLAS_NUM_THREADS '--run-dir'; : --run-dir 'runs/a b'"
     assert shell(tmp_path, "run_local.sh", stdin=line, OMP_NUM_THREADS="8").returncode == 0
     assert (tmp_path / "runs" / "a b.log").read_text() == "111 --run-dir\n"
+
+
+def test_paths_with_blanks(engine, tmp_path):
+    """A repository in a folder with a blank, a list with = in its name, and a log that cannot be written."""
+    (tmp_path / "my repository").symlink_to(ROOT)
+    (tmp_path / "K=4").write_text("echo fine --run-dir runs/fine/\ntrue --run-dir /dev/null/x\n")
+    done = subprocess.run([tmp_path / "my repository" / "sweeps" / "run_local.sh", "K=4"], cwd=tmp_path, text=True,
+                          capture_output=True, env=environment(tmp_path))  # fmt: skip
+    assert done.returncode == 1 and "1 done, 1 failed, 0 left" in done.stdout and "/dev/null" in done.stderr
+    assert (tmp_path / "runs" / "fine.log").read_text() == "fine --run-dir runs/fine/\n"
+
+
+def test_a_killed_executor_takes_its_trainings_along(engine, tmp_path):
+    """kill -9 of all that runs the jobs: the training saves and stops, and the same command continues."""
+    lines, long = tiny_sweep(tmp_path)
+    command = [ROOT / "sweeps" / "run_local.sh", "jobs"]
+    (tmp_path / "jobs").write_text(lines[0])
+    executor = subprocess.Popen(command, cwd=tmp_path, env=environment(tmp_path), start_new_session=True)
+    wait_until(lambda: saves(tmp_path / long))
+    training = training_of(tmp_path / long)
+    parent = int(re.search(r"PPid:\t(\d+)", Path(f"/proc/{training}/status").read_text())[1])
+    executor.kill()
+    os.kill(parent, signal.SIGKILL)
+    done = subprocess.run(command, cwd=tmp_path, env=environment(tmp_path), text=True, capture_output=True)
+    assert done.returncode == 0 and "1 done, 0 failed, 0 left" in done.stdout
+    assert joblog(tmp_path)[lines[0]][-1] == 0
+    assert "stopped by SIGTERM" in (tmp_path / "runs" / f"{long.name}.log").read_text()
 
 
 def test_dry_run_runs_nothing(tmp_path):
