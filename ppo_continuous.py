@@ -29,6 +29,7 @@ import sys
 import time
 import warnings
 import zipfile
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from importlib import import_module
 from importlib.metadata import version
@@ -290,16 +291,19 @@ class Environments:
         return self.obs, rewards, terminated, truncated, ended
 
     def state(self) -> dict:
-        """How many episodes each environment has started, and its actions since the last one's start."""
-        return {"episodes": self.episodes, "actions": [torch.tensor(np.array(a)) for a in self.actions]}
+        """How many episodes each environment has started, its actions since the last one's start, and where it is."""
+        actions = [torch.tensor(np.array(a)) for a in self.actions]
+        return {"episodes": self.episodes, "actions": actions, "obs": torch.tensor(self.obs)}
 
     def load(self, state: dict):
         """Bring every environment exactly to where it was, by replaying its running episode."""
-        for i, actions in enumerate(state["actions"]):
+        for i, actions in zip(range(len(self.envs)), state["actions"], strict=True):
             self.episodes[i] = state["episodes"][i] - 1
             self.obs[i] = self.reset(i)
             for action in actions.numpy():
                 self.obs[i], *_ = self.step_one(i, action)
+        if not np.array_equal(self.obs, state["obs"].numpy()):
+            print(f"warning: {self.env_id} does not repeat itself, so that the resumed run will differ")
 
 
 # --- Normaliser -------------------------------------------------------------------------------------------------------
@@ -467,6 +471,9 @@ class Agent:
 
 
 def copy_into(tensors: dict[str, torch.Tensor], saved: dict[str, torch.Tensor]):
+    """Copy saved tensors in place; ValueError if they are not the same ones."""
+    if {name: x.shape for name, x in tensors.items()} != {name: x.shape for name, x in saved.items()}:
+        raise ValueError
     for name, tensor in tensors.items():
         tensor.copy_(saved[name])
 
@@ -486,6 +493,7 @@ class Rollout:
     terminated: np.ndarray  # (T, N)
     truncated: np.ndarray  # (T, N)
     final_obs: dict[tuple[int, int], np.ndarray]  # (t, i) -> last observation of the episode that ended, normalised
+    first_obs: dict[tuple[int, int], np.ndarray]  # (t, i) -> first observation of the episode that followed, raw
     episodes: list[tuple[int, float, int]]  # (steps into the rollout, raw return, length)
 
 
@@ -502,7 +510,7 @@ def collect(agent: Agent, envs: Environments, obs: np.ndarray, num_steps: int, r
     logprobs = -(0.5 * noise**2 + log_std + 0.5 * math.log(2 * math.pi)).sum(-1)
     all_obs, actions = np.empty((num_steps + 1, *obs.shape), np.float32), np.empty_like(noise)
     next_obs = np.empty((num_steps, *obs.shape))
-    outcomes, final_obs, episodes = [], {}, []
+    outcomes, final_obs, first_obs, episodes = [], {}, {}, []
     for t in range(num_steps):
         all_obs[t] = obs
         actions[t] = agent.actor.mean(weights, obs) + perturbation[t]
@@ -513,11 +521,12 @@ def collect(agent: Agent, envs: Environments, obs: np.ndarray, num_steps: int, r
             next_obs[t, list(ended)] = [last for last, _, _ in ended.values()]
             last_obs = agent.normalizer.observe(next_obs[t, list(ended)])
             final_obs |= {(t, i): last for i, last in zip(ended, last_obs)}
+            first_obs |= {(t, i): raw_obs[i].copy() for i in ended}
             episodes += [((t + 1) * num_envs, episode_return, length) for _, episode_return, length in ended.values()]
         obs = agent.normalizer.observe(raw_obs)
     all_obs[-1] = obs
     rewards, *ends = map(np.array, zip(*outcomes))
-    return Rollout(all_obs, next_obs, actions, logprobs, rewards.astype(float), *ends, final_obs, episodes)
+    return Rollout(all_obs, next_obs, actions, logprobs, rewards.astype(float), *ends, final_obs, first_obs, episodes)
 
 
 def gae(rewards: np.ndarray, values: np.ndarray, ends: np.ndarray, gamma: float, gae_lambda: float) -> np.ndarray:
@@ -638,9 +647,21 @@ def compile_update(agent: Agent, moments) -> tuple:
     options["guard_filter_fn"] = torch.compiler.skip_all_guards_unsafe
     start, before = time.time(), [x.clone() for x in tensors]
     print("compiling the update (up to a minute the first time, seconds from the cache after that) ...", flush=True)
-    try:
+
+    def run_once():
         compiled = torch.compile(update, fullgraph=True, dynamic=False, options=options)
         compiled(agent.params, moments, agent.actor, args, batch, index, torch.ones(2, device=agent.device))
+        return compiled
+
+    try:
+        try:
+            compiled = run_once()
+        except Exception:  # whoever was killed while compiling may have left half a library in the cache
+            from torch._inductor.utils import fresh_cache  # takes seconds
+
+            torch._dynamo.reset()
+            with fresh_cache():
+                compiled = run_once()
     except Exception as error:  # no C++ compiler, no Python headers, ...: whatever it is, training can go on
         print(f"compilation failed, training goes on uncompiled: {first_line(error)}", flush=True)
         return update, False
@@ -670,6 +691,7 @@ def evaluate(agent: Agent, seeds: list[int], render_mode: str | None = None, vid
         for i in running:
             obs[i], _ = envs[i].reset(seed=seeds[i])
         while running:
+            returns[~np.isfinite(obs).all(-1)] = math.nan
             actions = np.clip(agent.actor.mean(weights, agent.normalizer.normalize(obs)), agent.low, agent.high)
             for i in running[:]:
                 obs[i], reward, terminated, truncated, _ = envs[i].step(actions[i])
@@ -696,14 +718,15 @@ def evaluate_checkpoint(path: Path, given: Args):
     """--evaluate: print a saved policy's returns, which for best.pt and last.pt are those in result.json."""
     checkpoint = load_checkpoint(path)
     own = ("evaluate", "final_eval_episodes", "render", "capture_video", "num_threads", "cuda", "track")
-    args = Args(**checkpoint["args"] | {name: getattr(given, name) for name in own})
-    agent = Agent(*check_args(args), args)
+    with refusing_damage(path):
+        args = Args(**checkpoint["args"] | {name: getattr(given, name) for name in own})
+        agent = Agent(*check_args(args), args)
+        agent.load(checkpoint)
+        seeds = evaluation_seeds(args, checkpoint["global_step"], final=True)
     limit_threads(args)
-    agent.load(checkpoint)
     videos = path.with_suffix(".videos") if args.capture_video else None
     if videos and videos.exists():
         refuse(f"{videos} exists already; move it away to record again")
-    seeds = evaluation_seeds(args, checkpoint["global_step"], final=True)
     returns, lengths = evaluate(agent, seeds, "human" if args.render else "rgb_array" if videos else None, videos)
     for i, (episode_return, length) in enumerate(zip(returns, lengths), start=1):
         print(f"episode {i}: return {episode_return:.3f}, length {length}")
@@ -719,10 +742,14 @@ def evaluate_checkpoint(path: Path, given: Args):
 def write_atomically(path: Path, data: bytes):
     """Replace `path` in one step: a full disk or a kill half-way leaves what was there."""
     temporary = path.with_name(path.name + ".tmp")
-    with open(temporary, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+    try:
+        with open(temporary, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError:
+        temporary.unlink(missing_ok=True)  # a full disk is not to stay full of it
+        raise
     os.replace(temporary, path)
 
 
@@ -733,19 +760,29 @@ def save_checkpoint(path: Path, state: dict):
     write_atomically(path, buffer.getvalue())
 
 
+@contextmanager
+def refusing_damage(path: Path):
+    """Refuse the checkpoint if what is done with it fails; torn, foreign and malicious ones fail in many ways."""
+    try:
+        yield
+    except Exception:
+        refuse(f"{path} is damaged or not a checkpoint of {SCRIPT}")
+
+
 def load_checkpoint(path: Path) -> dict:
-    """What `save_checkpoint` wrote, on the CPU, or a refusal; nothing in the file is ever executed."""
+    """What `save_checkpoint` wrote, on the CPU, or a refusal.
+
+    Nothing in the file is executed; but as on the command line, the id of its task can name a module to import.
+    """
     if not path.is_file():
         refuse(f"there is no checkpoint {path}")
-    try:
+    with refusing_damage(path):
         if zipfile.ZipFile(path).testzip():  # torch.load looks at no checksum
             raise ValueError
         state = torch.load(path, map_location="cpu", weights_only=True)
         if not state.keys() >= {"args", "global_step", "params", "normalizer"}:
             raise ValueError
         flags = set(state["args"])
-    except Exception:  # torn, foreign or malicious: the zip and pickle readers have many errors for it
-        refuse(f"{path} is damaged or not a checkpoint of {SCRIPT}")
     if flags != {field.name for field in fields(Args)}:
         refuse(f"{path} was not written by this {SCRIPT}: it has other flags")
     return state
@@ -791,7 +828,7 @@ def open_run(args: Args) -> tuple[Path, dict | None]:
             refuse(f"the run folder {run_dir} is not empty; name another --run-dir, or continue its run with --resume")
         begun = (run_dir / "config.json").exists()
         if not begun:
-            if any((run_dir / name).exists() for name in ("last.pt", "result.json")):
+            if any((run_dir / name).exists() for name in ("best.pt", "last.pt", "evaluations.csv", "result.json")):
                 refuse(f"the run in {run_dir} has lost its config.json, so that it cannot be continued")
             write_atomically(run_dir / "config.json", json.dumps(config, indent=2).encode())
         old = json.loads((run_dir / "config.json").read_text())
@@ -810,37 +847,43 @@ def open_run(args: Args) -> tuple[Path, dict | None]:
         raise SystemExit(0)
     if not begun:
         return run_dir, None
+    saved = None
+    if (run_dir / "last.pt").exists():
+        if old["versions"] != config["versions"]:
+            refuse(f"the run in {run_dir} can be continued exactly with its own versions only: {old['versions']}")
+        if old["cpu"] != config["cpu"]:
+            print(f"warning: begun on {old['cpu']}; on {config['cpu']} the last bits of its numbers may differ")
+        if old["git_commit"] != config["git_commit"]:
+            print(f"warning: begun with the code of commit {old['git_commit']}, which is another one now")
+        saved = load_checkpoint(run_dir / "last.pt")
+        if changed_flags(saved["args"], asdict(args)) or not saved.keys() >= RESUMED:
+            refuse(f"{run_dir / 'last.pt'} is no checkpoint to continue the run in {run_dir} from")
     for leftover in (*run_dir.glob("*.pt.tmp"), *run_dir.glob("*.json.tmp"), run_dir / "failure.json"):
         leftover.unlink(missing_ok=True)  # of a process that was killed or failed
-    if not (run_dir / "last.pt").exists():
+    if saved is None:
         for leftover in run_dir.glob("events.out.tfevents.*"):
             leftover.unlink()
         write_atomically(run_dir / "config.json", json.dumps(config, indent=2).encode())
-        return run_dir, None
-    if old["versions"] != config["versions"]:
-        refuse(f"the run in {run_dir} can be continued exactly with its own versions only: {old['versions']}")
-    if old["cpu"] != config["cpu"]:
-        print(f"warning: begun on {old['cpu']}; on {config['cpu']} the last bits of its numbers may differ")
-    saved = load_checkpoint(run_dir / "last.pt")
-    if changed_flags(saved["args"], asdict(args)) or not saved.keys() >= RESUMED:
-        refuse(f"{run_dir / 'last.pt'} is no checkpoint to continue the run in {run_dir} from")
     return run_dir, saved
 
 
 def fail_numerically(run_dir: Path, **facts):
     """End the run where a number is not finite: say which, where and when; the last checkpoint is left as it is."""
     facts["mujoco_warnings"] = mujoco_warnings[:5]
-    write_atomically(run_dir / "failure.json", json.dumps(facts, indent=2).encode())
     print(f"{SCRIPT}: numerical failure: {facts} (also in {run_dir / 'failure.json'})", file=sys.stderr)
+    write_atomically(run_dir / "failure.json", json.dumps(facts, indent=2).encode())
     raise SystemExit(EXIT_FAILURE)
 
 
 def check_rollout(run_dir: Path, roll: Rollout, step: int):
     """Fail at the first reward or observation that is not finite."""
     bad = ~np.isfinite(roll.rewards) | ~np.isfinite(roll.next_obs).all(-1)
+    for at, obs in roll.first_obs.items():
+        bad[at] |= not np.isfinite(obs).all()
     if bad.any():
         t, i = np.argwhere(bad)[0].tolist()
         values = {"reward": roll.rewards[t, i], "action": roll.actions[t, i], "next_obs": roll.next_obs[t, i]}
+        values |= {"first_obs": roll.first_obs[t, i]} if (t, i) in roll.first_obs else {}
         values = {name: str(value.tolist()) for name, value in values.items()}  # JSON has no NaN
         step += (t + 1) * bad.shape[1]
         fail_numerically(run_dir, what="a reward or an observation", global_step=step, env=i, **values)
@@ -864,12 +907,13 @@ def main():
     def request_stop(signum, _):
         signals.append(signum)
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # a second Ctrl-C stops at once
+        os.write(2, b"\nstopping after this iteration ...\n")  # print() may be in the middle of a line
 
     def exit_if_stopped():
         if signals:
             missing = ([] if args.run_dir else ["--run-dir", str(run_dir)]) + ([] if args.resume else ["--resume"])
             print(f"\nstopped by {signal.Signals(signals[0]).name}; continue with\n"
-                  f"    {shlex.join(['python', *sys.argv, *missing])}")  # fmt: skip
+                  f"    {shlex.join([sys.executable, *sys.argv, *missing])}")  # fmt: skip
             raise SystemExit(EXIT_STOPPED)
 
     for signum in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1):
@@ -888,11 +932,12 @@ def main():
     progress = {"global_step": 0, "adam_steps": 0, "best_return": -math.inf, "evaluations": [], "late_returns": [],
                 "train_seconds": 0.0, "wall_seconds": 0.0}  # fmt: skip
     if saved:
-        agent.load(saved)
-        copy_into(moments, saved["moments"])
-        envs.load(saved["envs"])
-        rng.bit_generator.state = saved["rng"]
-        progress = saved["progress"]
+        with refusing_damage(run_dir / "last.pt"):
+            agent.load(saved)
+            copy_into(moments, saved["moments"])
+            envs.load(saved["envs"])
+            rng.bit_generator.state = saved["rng"]
+            progress = {name: saved["progress"][name] for name in progress}
     obs = agent.normalizer.normalize(envs.obs) if saved else agent.normalizer.observe(envs.obs)
     step, last_step = progress["global_step"], args.num_iterations * args.batch_size
 
@@ -915,10 +960,11 @@ def main():
         flags = {k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in asdict(args).items()}
         for summary in hparams(flags, {"final/best_mean": 0, "final/last_mean": 0}):
             writer.file_writer.add_summary(summary)  # add_hparams would make a subfolder
-    update_function, compiled = compile_update(agent, moments) if args.compile else (update, False)
+    compiling = args.compile and (not saved or saved["compiled"])
+    update_function, compiled = compile_update(agent, moments) if compiling else (update, False)
     exit_if_stopped()
-    if saved and saved["compiled"] != compiled:
-        refuse(f"the run in {run_dir} was {'' if saved['compiled'] else 'not '}compiled, and continues exactly only so")
+    if compiling and saved and not compiled:
+        refuse(f"the run in {run_dir} was compiled, and continues exactly only so")
 
     bar = tqdm(total=last_step, initial=step, unit=" steps", unit_scale=True, smoothing=0.05,
                disable=None if args.progress else True)  # fmt: skip

@@ -17,6 +17,7 @@ Failures; episodes of 50 steps, and 100 sound steps over all episodes, counted f
     InfReward-v0        then every reward is infinite
     NanObs-v0           then every observation is NaN
     Crash-v0            then every step raises RuntimeError
+    NanFirstObs-v0      sound but for the first observation of the third episode in the third copy that is made
 
 Spaces; episodes of 50 steps with reward 0:
     Unbounded-v0        two actions without bounds
@@ -146,6 +147,20 @@ class Crash(Failing):
         raise RuntimeError("the simulator crashed")
 
 
+class NanFirstObs(Probe):
+    made = 0
+
+    def __init__(self, render_mode=None):
+        super().__init__(render_mode)
+        NanFirstObs.made += 1
+        self.number, self.episodes = NanFirstObs.made, 0
+
+    def reset(self, seed=None, options=None):
+        obs, info = super().reset(seed=seed)
+        self.episodes += 1
+        return (obs * np.nan if (self.number, self.episodes) == (3, 3) else obs), info
+
+
 class Unbounded(Probe):
     action_space = Box(-np.inf, np.inf, (2,))
 
@@ -172,5 +187,5 @@ for env in (ConstantReward, MatchAction, TwoStepCredit, Coordination, Terminator
     gym.register(f"{env.__name__}-v0", env)
 gym.register("Counter-v0", Counter, max_episode_steps=7)
 gym.register("Discrete-v0", DiscreteActions, max_episode_steps=50)
-for env in (NanReward, InfReward, NanObs, Crash, Unbounded, DictObs, ImageObs):
+for env in (NanReward, InfReward, NanObs, Crash, NanFirstObs, Unbounded, DictObs, ImageObs):
     gym.register(f"{env.__name__}-v0", env, max_episode_steps=50)

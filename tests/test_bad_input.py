@@ -3,6 +3,8 @@
 import json
 import zipfile
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 from conftest import run
@@ -174,9 +176,31 @@ def a_folder(path):
     path.mkdir()
 
 
-@pytest.mark.parametrize(
-    "damage", [torn, text, another_zip, another_model, a_tensor, a_folder], ids=lambda damage: damage.__name__
-)
+def other_parts(path, **parts):
+    torch.save(torch.load(path) | parts, path)
+
+
+def no_parameters(path):
+    other_parts(path, params={})
+
+
+def small_parameters(path):  # which would fill the right ones, if copied into them
+    other_parts(path, params={name: torch.ones(1) for name in torch.load(path)["params"]})
+
+
+def text_for_a_number(path):
+    other_parts(path, args=torch.load(path)["args"] | {"num_envs": "3"})
+
+
+def text_for_the_step(path):
+    other_parts(path, global_step="many")
+
+
+NO_CHECKPOINTS = torn, text, another_zip, another_model, a_tensor, a_folder
+MALFORMED = no_parameters, small_parameters, text_for_a_number, text_for_the_step
+
+
+@pytest.mark.parametrize("damage", [*NO_CHECKPOINTS, *MALFORMED], ids=lambda damage: damage.__name__)
 def test_evaluating_what_is_no_checkpoint(checkpoint, refuses, damage):
     damage(checkpoint)
     assert str(checkpoint) in refuses("--evaluate", checkpoint)
@@ -238,6 +262,26 @@ def test_environment_that_goes_wrong(script, env, name, value, tmp_path):
     (line,) = done.stderr.splitlines()
     assert failure["what"] in line and "202" in line and value in line and "failure.json" in line
     check_checkpoints(tmp_path / "run", step=192)
+
+
+def test_first_observation_that_is_not_finite(script, tmp_path):
+    """The third copy of the task is the second environment; its third episode begins after 2 x 50 steps in each."""
+    flags = ("--num-envs", 2, "--total-timesteps", 640, "--run-dir", tmp_path / "run")
+    done = run(f"{script.__name__}.py", *QUICK, *KEEP_ALL, "--env-id", "probe_envs:NanFirstObs-v0", *flags)
+    failure = read_failure(tmp_path / "run")
+    assert (done.returncode, failure["global_step"], failure["env"], failure["first_obs"]) == (3, 200, 1, "[nan]")
+
+
+@pytest.mark.parametrize("env, step", [("NanObs", 102), ("NanReward", 101)])
+def test_evaluation_that_is_not_finite(script, env, step, monkeypatch):
+    """An episode's return is NaN as soon as an observation or a reward is, though the other stays sound."""
+    task = gym.make(f"probe_envs:{env}-v0", max_episode_steps=step)
+    args = script.Args(env_id=f"probe_envs:{env}-v0", actor_hidden=(8,), critic_hidden=(8,))
+    agent = script.Agent(task.observation_space, task.action_space, args)
+    monkeypatch.setattr(script, "make_env", lambda *_: gym.make(args.env_id, max_episode_steps=step - 1))
+    assert np.isfinite(script.evaluate(agent, [0, 2])[0]).all()
+    monkeypatch.setattr(script, "make_env", lambda *_: gym.make(args.env_id, max_episode_steps=step))
+    assert np.isnan(script.evaluate(agent, [0, 2])[0]).all()
 
 
 def test_absurd_learning_rate(script, tmp_path):

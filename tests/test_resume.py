@@ -137,6 +137,18 @@ def test_replay_is_exact(script, env_id, episodes):
         assert (obs_again.tolist(), others_again, repr(ended_again)) == (obs, others, ended)
 
 
+def test_a_task_that_does_not_repeat_itself_is_warned_of(script, capsys):
+    """`envs/obs` is there to be compared with what the replay leads to."""
+    envs = script.Environments("Pendulum-v1", 2, seed=3)
+    envs.step(np.zeros((2, 1), np.float32))
+    state = envs.state()
+    script.Environments("Pendulum-v1", 2, seed=3).load(state)
+    assert capsys.readouterr().out == ""
+    state["obs"][1, 0] += 1e-6
+    script.Environments("Pendulum-v1", 2, seed=3).load(state)
+    assert "Pendulum-v1 does not repeat itself" in capsys.readouterr().out
+
+
 # --- Negative controls: every part of the saved state is needed -------------------------------------------------------
 
 NETWORKS = [f"{net}.{i}.{kind}" for net in ("actor", "critic") for i in (0, 1) for kind in ("weight", "bias")]
@@ -148,7 +160,7 @@ PARTS = [
     *("envs/episodes", "envs/actions", "rng"),
     *(f"progress/{name}" for name in ("global_step", "adam_steps", "best_return", "evaluations", "late_returns")),
 ]
-NOT_COMPARED = "args", "global_step", "compiled", "progress/train_seconds", "progress/wall_seconds"
+NOT_COMPARED = "args", "global_step", "compiled", "progress/train_seconds", "progress/wall_seconds", "envs/obs"
 
 
 @pytest.fixture(scope="module")
@@ -312,7 +324,7 @@ def test_another_processor_is_warned_of(name, killed, tmp_path):
 
 
 def test_another_compile_mode_is_refused(name, tmp_path):
-    """The flag is as before, but this time compilation fails."""
+    """The flag is as before, but this time compilation fails; begun uncompiled, a run is not compiled later either."""
 
     def no_compiler(*_):
         raise RuntimeError("no C++ compiler")
@@ -325,6 +337,9 @@ def test_another_compile_mode_is_refused(name, tmp_path):
     assert killed.wait() == -signal.SIGKILL and "training goes on uncompiled" in killed.output()
     state = torch.load(tmp_path / "run/last.pt")
     assert state["compiled"] is False
+    shutil.copytree(tmp_path / "run", tmp_path / "sound")
+    words_there = ["--run-dir", tmp_path / "sound", *words[2:]]
+    assert "compiling the update" not in finish(name, words_there, tmp_path / "log there")
     torch.save(state | {"compiled": True}, tmp_path / "run/last.pt")
     refused = Run(name, words, tmp_path / "log", before=break_compiler)
     assert refused.wait() == 2 and "was compiled, and continues exactly only so" in refused.output()

@@ -1,6 +1,7 @@
 """The loss, the update and the actor, held equal to the eager reference, torch.optim and torch.distributions."""
 
 import json
+import os
 
 import gymnasium as gym
 import numpy as np
@@ -154,6 +155,22 @@ def test_target_kl_ends_the_epochs(script):
 
 
 # --- Compilation ------------------------------------------------------------------------------------------------------
+
+
+def test_a_damaged_compile_cache_is_left_aside(script, monkeypatch, capsys):
+    """Compilation is tried again with a new cache; the update must then not be taken for uncompiled."""
+    caches = []
+
+    def compile_or_fail(function, **_):
+        caches.append(os.environ.get("TORCHINDUCTOR_CACHE_DIR"))
+        if len(caches) == 1:
+            raise ImportError("main.so: file too short")
+        return function
+
+    monkeypatch.setattr(torch, "compile", compile_or_fail)
+    agent = make_agent(script, torch.float32)
+    assert script.compile_update(agent, script.init_moments(agent.params)) == (script.update, True)
+    assert len(set(caches)) == 2 and "failed" not in capsys.readouterr().out
 
 
 def test_compiled_update_equals_the_eager_one(script):
