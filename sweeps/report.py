@@ -2,15 +2,17 @@
 
     python sweeps/report.py runs
 
-Reads config.json, evaluations.csv and result.json of every run folder below RUNS_DIR, but for searches (tune.py); links
-are followed. Writes report.md with its figures (PNG, PDF), and each table also as CSV and LaTeX (booktabs). A sweep that
-is not complete reports what is there and says what is missing; folders that cannot be used are named with the reason.
+Reads config.json, evaluations.csv and result.json of every run folder below RUNS_DIR, but for searches (tune.py);
+links are followed. Writes report.md with its figures (PNG, PDF), and each table also as CSV and LaTeX (booktabs). A
+sweep that is not complete reports what is there and says what is missing; folders that cannot be used are named with
+the reason.
 
 All seeds of a setting (task, K, schedule) share all other flags. Of several variants of a setting the one with the
-most finished seeds counts, then the one with the most steps; the others are named. RefinePPO in Table 1 has the K and
-schedule that the task's file in --settings asks for, else those of --depth and --schedule.
+flags that --settings asks for counts, then that with the most finished seeds, then the most steps; the others are
+named. RefinePPO has the K and schedule that --settings asks for, else those of --depth and --schedule.
 """
 
+import ast
 import csv
 import io
 import json
@@ -21,7 +23,9 @@ import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -40,12 +44,13 @@ FIRST_SEARCH_SEED = 1001  # seeds from here on belong to hyperparameter searches
 RESAMPLES = 10_000  # of each bootstrap
 SELECTIONS = {"best": "best checkpoint", "last": "last checkpoint", "last10": "last 10 % of training"}
 
-RUN_FILES = {"config.json", "evaluations.csv", "result.json", "last.pt"}
+RUN_FILES = {"config.json", "evaluations.csv", "result.json", "last.pt", "best.pt"}
 CURVE_HEADER = "global_step,return_mean,return_std,return_min,return_max,length_mean"
 OWN_FLAGS = set(  # in which the seeds of a setting may differ
     "seed exp_name run_dir resume progress track wandb_project_name wandb_entity capture_video render evaluate compile"
     " cuda num_threads torch_deterministic checkpoint_interval save_every".split()
 )
+SWEPT_FLAGS = {"env_id", "total_timesteps", "refinement_depth", "refinement_schedule"}  # by the generators
 MARK = "<!-- made by sweeps/report.py -->"
 TABLES = "table1 table2 depth depth_normalised sample_efficiency selection seeds aggregate toy".split()
 FIGURES = "training_curves depth action_dimension seeds".split()
@@ -63,8 +68,8 @@ class Args:
     """refinement depth K that stands for RefinePPO"""
     schedule: Literal["average", "uniform", "inverse"] = "average"
     """refinement schedule that stands for RefinePPO"""
-    settings: Path = HERE / "settings"
-    """folder whose files refineppo/<task>.args may ask for another depth or schedule"""
+    settings: Path = field(default_factory=lambda: Path(os.environ.get("SETTINGS") or HERE / "settings"))
+    """folder of the tasks' settings, {ppo,refineppo}/<task>.args, or `none`; default SETTINGS as in the generators"""
 
 
 def refuse(sentence: str):
@@ -117,10 +122,14 @@ class Run:
         return f"evaluated up to step {step:,} of {self.args['total_timesteps']:,}{failure}"
 
     @property
+    def is_search(self) -> bool:
+        return self.args["seed"] >= FIRST_SEARCH_SEED
+
+    @property
     def variant(self) -> tuple:
         """Equal for runs that differ in nothing but their seed."""
         flags = {name: json.dumps(value) for name, value in self.args.items() if name not in OWN_FLAGS}
-        return self.args["seed"] >= FIRST_SEARCH_SEED, *sorted(flags.items())
+        return self.is_search, *sorted(flags.items())
 
 
 class Unusable(Exception):
@@ -166,7 +175,7 @@ def read_scores(path: Path, args: dict) -> dict[str, float]:
 
 def read_run(folder: Path, name: str) -> Run:
     if not (folder / "config.json").exists():
-        raise Unusable("torn: there is no config.json")
+        raise Unusable("torn or foreign: there is no config.json")
     config = read_json(folder / "config.json")
     args = config.get("args") if isinstance(config, dict) else None
     types = {"env_id": str, "seed": int, "total_timesteps": int}
@@ -193,12 +202,13 @@ def find_runs(root: Path) -> tuple[list[Run], dict[str, str]]:
             subfolders.clear()
             continue
         seen.add((status.st_dev, status.st_ino))
-        if "trials.csv" in files:
-            skipped[os.path.relpath(path, root)] = "a search by tune.py, which does not report"
+        name = os.path.relpath(path, root)
+        if {"trials.csv", "journal.log"} & {*files}:
+            skipped[name] = "a search by tune.py, which does not report"
             subfolders.clear()
         subfolders.sort()
-        if RUN_FILES & {*files}:
-            name = os.path.relpath(path, root)
+        logged = any(file.startswith("events.out.tfevents.") for file in files)
+        if RUN_FILES & {*files} or logged and not any(Path(name).is_relative_to(run.name) for run in runs):
             try:
                 runs.append(read_run(Path(path), name))
             except Unusable as reason:
@@ -218,22 +228,71 @@ def quoted(run: Run) -> str:
     return f"`{run.name}`"
 
 
+@cache
+def defaults(algorithm: str) -> dict:
+    """The defaults of a training script's flags, but for OWN_FLAGS; read, since an import would need torch."""
+    classes = ast.parse((HERE.parent / f"{algorithm}_continuous.py").read_text()).body
+    (body,) = (node.body for node in classes if isinstance(node, ast.ClassDef) and node.name == "Args")
+    flags = {}
+    for node in body:
+        if isinstance(node, ast.AnnAssign) and node.target.id not in OWN_FLAGS:
+            with suppress(ValueError):  # no literal
+                flags[node.target.id] = json.loads(json.dumps(ast.literal_eval(node.value)))
+    return flags
+
+
+def asked_flags(settings: Path, algorithm: str, task: str) -> dict:
+    """The flags of `defaults` that a task's settings file sets, and for the toy its generator."""
+    file, flags, text = settings / algorithm / f"{task.replace('/', '_')}.args", {}, ""
+    if task == TOY:
+        text = "".join(re.findall(r'^extra\+?="(.*)"$', (HERE / "toy.sh").read_text(), re.MULTILINE))
+    try:
+        if str(settings) != "none" and file.is_file():
+            text += "\n" + re.sub("#.*", "", file.read_text())
+        for part in re.split(r"(?<!\S)--", text)[1:]:
+            flag, *words = re.split(r"[\s=]+", part.strip())
+            name, value = flag.replace("-", "_"), " ".join(words)
+            default = defaults(algorithm).get(name.removeprefix("no_"), ...)
+            if isinstance(default, bool):
+                flags[name.removeprefix("no_")] = not name.startswith("no_")
+            elif isinstance(default, list):
+                flags[name] = [*map(type(default[0]), words)]
+            elif default is not ...:
+                kind = float if default is None else type(default)
+                flags[name] = None if value == "None" else kind(value)
+    except (OSError, ValueError) as error:
+        refuse(f"cannot use the settings in {file}: {error}")
+    return flags
+
+
+def named_flags(names: Iterable[str], flags: dict, label: str, others: dict) -> str:
+    return ", ".join(f"--{n.replace('_', '-')} {flags.get(n)} ({label}: {others.get(n)})" for n in sorted(names))
+
+
+def unasked(run: Run, settings: Path) -> str:
+    """The flags of a run that the settings ask to be others; one that its config.json lacks is as asked."""
+    algorithm = "ppo" if run.setting.depth is None else "refineppo"
+    asked = defaults(algorithm) | asked_flags(settings, algorithm, run.setting.task)
+    names = {name for name in asked.keys() & run.args.keys() - SWEPT_FLAGS if run.args[name] != asked[name]}
+    return named_flags(names, run.args, "asked for", asked)
+
+
 def difference(run: Run, other: Run) -> str:
-    """The flags in which a run differs from the variant that is reported, as a user types them."""
-    if run.variant[0] != other.variant[0]:
+    """The flags in which a run differs from the variant that is reported."""
+    if run.is_search and not other.is_search:
         return f"seeds from {FIRST_SEARCH_SEED} on, of a search"
-    names = sorted({name for name, _ in set(run.variant[1:]) ^ set(other.variant[1:])})
-    flags = (f"--{n.replace('_', '-')} {run.args.get(n)} (reported: {other.args.get(n)})" for n in names)
-    return ", ".join(flags)
+    names = {name for name, _ in set(run.variant[1:]) ^ set(other.variant[1:])}
+    return named_flags(names, run.args, "reported", other.args)
 
 
-def choose(runs: list[Run]) -> tuple[dict[Setting, list[Run]], list[str]]:
+def choose(runs: list[Run], settings: Path) -> tuple[dict[Setting, list[Run]], list[str]]:
     """One variant of each setting, each of its seeds once, by seed; and what that leaves out."""
     chosen, left_out = {}, []
 
     def rank(variant: list[Run]) -> tuple:
-        finished = {run.args["seed"] for run in variant if run.scores}
-        return not variant[0].variant[0], len(finished), variant[0].args["total_timesteps"], len(variant)
+        first, finished = variant[0], {run.args["seed"] for run in variant if run.scores}
+        order = not first.is_search, not unasked(first, settings), len(finished)
+        return *order, first.args["total_timesteps"], len(variant)
 
     for setting, group in grouped(runs, lambda run: run.setting).items():
         variants = [*grouped(group, lambda run: run.variant).values()]
@@ -271,15 +330,18 @@ class Sweep:
         others = {setting.task for setting in runs} - {*self.paper_tasks, TOY}
         self.tasks = [*self.paper_tasks, *sorted(others)]
         self.pairs = {task: (Setting(task), self.refineppo(task)) for task in self.tasks}
+        self.reported = {setting for pair in self.pairs.values() for setting in pair}  # in any table or in Fig. 2
 
     def refineppo(self, task: str) -> Setting:
         """The setting that stands for RefinePPO."""
-        file = self.args.settings / "refineppo" / f"{task}.args"
-        flags = re.sub("#.*", "", file.read_text()) if file.is_file() else ""
-        depth = re.search(r"--refinement-depth[\s=]+(\d+)", flags)
-        schedule = re.search(r"--refinement-schedule[\s=]+(\w+)", flags)
-        return Setting(task, int(depth[1]) if depth else self.args.depth,
-                       schedule[1] if schedule else self.args.schedule)  # fmt: skip
+        flags = {"refinement_depth": self.args.depth, "refinement_schedule": self.args.schedule}
+        flags |= asked_flags(self.args.settings, "refineppo", task)
+        return Setting(task, flags["refinement_depth"], flags["refinement_schedule"])
+
+    def standing(self, tasks: Iterable[str], part: str) -> str:
+        """The depth or the schedule that stands for RefinePPO, with the tasks of each if they differ."""
+        groups = grouped(tasks, lambda task: getattr(self.pairs[task][1], part))
+        return ", ".join(f"{value}" + f" ({', '.join(of)})" * (len(groups) > 1) for value, of in groups.items())
 
     def finished(self, setting: Setting) -> list[Run]:
         return [run for run in self.runs.get(setting, []) if run.scores]
@@ -293,7 +355,8 @@ class Sweep:
         return scores[np.isfinite(scores)]
 
     def seeds_and_steps(self, *settings: Setting) -> dict[str, int | str]:
-        """How many finished seeds the settings have, and of how many steps."""
+        """How many finished seeds the settings have, and of how many steps; a table's row of them ends so."""
+        self.reported |= {*settings}
         runs = [*map(self.finished, settings)]
         steps = [seeds[0].args["total_timesteps"] for seeds in runs if seeds]
         return {"seeds": together([*map(len, runs)]), "steps": together(steps)}
@@ -621,32 +684,35 @@ def across_settings(sweep: Sweep, report: Report, name: str, settings: dict[str,
 
 
 def table_2(sweep: Sweep, report: Report):
-    depth, tasks = sweep.args.depth, dict.fromkeys(task for task, _ in sweep.table2)
-    report.say(f"## Table 2: refinement schedules, K = {depth}")
+    report.say("## Table 2: refinement schedules")
+    settings = {task: {schedule: refineppo._replace(schedule=schedule) for schedule in SCHEDULES}
+                for task, (_, refineppo) in sweep.pairs.items()}  # fmt: skip
+    tasks = dict.fromkeys(task for task, _ in sweep.table2)
     for schedule in SCHEDULES:
-        report.expect(f"Table 2, {schedule}", sweep, [Setting(task, depth, schedule) for task in tasks])
-    settings = {task: {schedule: Setting(task, depth, schedule) for schedule in SCHEDULES} for task in sweep.tasks}
+        report.expect(f"Table 2, {schedule}", sweep, [settings[task][schedule] for task in tasks])
     several = {task: of_task for task, of_task in settings.items()
                if sum(len(sweep.finished(setting)) > 0 for setting in of_task.values()) > 1}  # fmt: skip
     if not several:
         return report.say("No task with finished runs of at least two schedules.")
     report.say("Return of the best checkpoint's final evaluation, mean ± standard deviation over seeds; tasks with at "
-               "least two schedules. The paper gives means alone, for K = 4.")  # fmt: skip
+               f"least two schedules. K = {sweep.standing(several, 'depth')}; the paper's is 4, and it gives means "
+               "alone.")  # fmt: skip
     across_settings(sweep, report, "table2", several, sweep.table2)
 
 
 def depth_figure(sweep: Sweep, report: Report):
-    schedule = sweep.args.schedule
-    report.say(f"## Fig. 4: refinement depth, {schedule} schedule")
+    report.say("## Fig. 4: refinement depth")
+    refineppo = {task: pair[1] for task, pair in sweep.pairs.items()}
     for depth in DEPTHS:
-        report.expect(f"Fig. 4, K = {depth}", sweep, [Setting(task, depth, schedule) for task in sweep.paper_tasks])
-    have = {task: {s.depth for s in sweep.runs if s == (task, s.depth, schedule) and sweep.finished(s)}
-            for task in sweep.tasks}  # fmt: skip
+        settings = [refineppo[task]._replace(depth=depth) for task in sweep.paper_tasks]
+        report.expect(f"Fig. 4, K = {depth}", sweep, settings)
+    have = {task: {s.depth for s in sweep.runs if s == of._replace(depth=s.depth) and sweep.finished(s)}
+            for task, of in refineppo.items()}  # fmt: skip
     depths = sorted(set().union(*(of_task for of_task in have.values() if len(of_task) > 1)))
     tasks = [task for task in sweep.tasks if depths and {*depths} <= have[task]]
     if not tasks:
         return report.say("No task with finished runs of " + (f"all depths, {depths}." if depths else "two depths."))
-    settings = {task: {f"K = {depth}": Setting(task, depth, schedule) for depth in depths} for task in tasks}
+    settings = {task: {f"K = {depth}": refineppo[task]._replace(depth=depth) for depth in depths} for task in tasks}
     returns = {task: np.array([mean(sweep.scores(setting)) for setting in settings[task].values()]) for task in tasks}
     panels = {"min-max": [min_max(values) for values in returns.values()]}
     if bounded := [sweep.normalise(task, returns[task]) for task in tasks if task in sweep.bounds]:
@@ -662,7 +728,8 @@ def depth_figure(sweep: Sweep, report: Report):
         axis.set_xticks(range(len(depths)), depths)
         axis.set(title=name, xlabel="refinement depth $K$", ylabel="normalised return", xlim=(-0.4, len(depths) - 0.6))
         axis.grid(axis="y", color="0.9", linewidth=0.5)
-    caption = "Normalised mean returns: mean ± 1 standard deviation (ddof 1) over tasks. Left, as in the paper: "
+    caption = f"Schedule: {sweep.standing(tasks, 'schedule')}. "
+    caption += "Normalised mean returns: mean ± 1 standard deviation (ddof 1) over tasks. Left, as in the paper: "
     caption += "0 is the worst K of a task and 1 the best, however little they differ. Right: 0 is the random policy "
     caption += "and 1 the task's reference in `sweeps/bounds.csv`."
     caption += naming(" That has no bounds for ", (task for task in tasks if task not in sweep.bounds))
@@ -791,7 +858,7 @@ def toy(sweep: Sweep, report: Report):
 def check_folder(folder: Path):
     """Refuse an output folder that cannot be written, or that holds anything that a report did not make."""
     try:
-        present = {path.name for path in folder.iterdir()} if folder.exists() else set()
+        present = {path.name for path in folder.iterdir() if path.name[0] != "."} if folder.exists() else set()
         ours = "report.md" in present and (folder / "report.md").read_bytes().startswith(MARK.encode())
         if present and not (ours and present <= OUTPUTS):
             refuse(f"{folder} holds files that no report has made; name another --out-dir")
@@ -806,17 +873,17 @@ def main():
     folder = args.out_dir or args.runs_dir / "report"
     if args.depth < 1:
         refuse(f"--depth must be at least 1, not {args.depth}")
-    if args.settings != Args.settings and not args.settings.is_dir():
-        refuse(f"--settings must be a folder, and {args.settings} is none")
+    if str(args.settings) != "none" and not args.settings.is_dir():
+        refuse(f"--settings must be a folder, and {args.settings} is not one")
     if not args.runs_dir.is_dir():
         refuse(f"{args.runs_dir} is not a folder of runs" if args.runs_dir.exists() else f"there is no {args.runs_dir}")
     runs, skipped = find_runs(args.runs_dir)
     if not runs:
         reasons = "".join(f"; {name}: {reason}" for name, reason in skipped.items())
         refuse(f"there is no run to report in {args.runs_dir}{reasons}")
-    check_folder(folder)
-    chosen, left_out = choose(runs)
+    chosen, left_out = choose(runs, args.settings)
     sweep, report = Sweep(chosen, args), Report(f"Report of {args.runs_dir}")
+    check_folder(folder)
     unfinished = [run for run in runs if not run.scores]
     counts = f"{len(runs) - len(unfinished)} finished, {len(unfinished)} unfinished, {len(skipped)} skipped"
     report.say(f"RefinePPO is K = {args.depth} with the {args.schedule} schedule, unless Table 1 says otherwise. "
@@ -830,6 +897,17 @@ def main():
         action_dimension(sweep, report, rows)
         few_seeds(sweep, report)
         toy(sweep, report)
+    warnings, unshown = [], []
+    for setting, (run, *_) in chosen.items():
+        name = f"{setting.task}, {setting.method}"
+        if setting not in sweep.reported:
+            unshown.append(naming(f"{name}: ", map(quoted, sweep.finished(setting))))
+            continue
+        if flags := unasked(run, args.settings):
+            warnings.append(f"**Other flags than the settings ask for:** {name}: {flags}")
+        if run.is_search:
+            warnings.append(f"**Seeds from {FIRST_SEARCH_SEED} on, of a search:** {name}")
+    report.text[1:1] = warnings
     report.say("## What is missing or left out")
     for title, lines in {
         f"Fewer finished seeds than the paper's {SEEDS}": report.missing,
@@ -837,8 +915,11 @@ def main():
         "Finished runs without evaluations (in tables of final returns alone)": [
             quoted(run) for run in runs if run.scores and not len(run.curve)
         ],
-        "Torn, foreign or unreadable folders, and searches (skipped)": [f"`{name}`: {why}" for name, why in skipped.items()],
-        "Duplicates, and variants of a setting with fewer finished seeds or steps (left out)": left_out,
+        "Finished runs in no table": [*filter(None, unshown)],
+        "Torn, foreign or unreadable folders, and searches (skipped)": [
+            f"`{name}`: {why}" for name, why in skipped.items()
+        ],
+        "Duplicates and other variants (left out)": left_out,
     }.items():
         report.say(f"{title}: none." if not lines else f"{title}:\n\n" + "\n".join(f"- {line}" for line in lines))
     files = {"report.md": "\n\n".join([*report.text, ""]).encode(), **report.files}

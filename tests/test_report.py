@@ -51,6 +51,20 @@ def make_seeds(root: Path, task: str, bests: list[float], depth=None, schedule="
         make_run(root, f"{task}-{depth}-{schedule}-{seed}", task, seed, best, depth=depth, schedule=schedule, **more)
 
 
+def make_settings(root: Path, algorithm: str, task: str, text: str) -> Path:
+    """A settings folder with one more file."""
+    file = root / "settings" / algorithm / f"{task}.args"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text)
+    return root / "settings"
+
+
+@pytest.fixture(autouse=True)
+def no_settings(monkeypatch):
+    """The scripts' defaults, whatever sweeps/settings holds and the shell sets."""
+    monkeypatch.setenv("SETTINGS", "none")
+
+
 @pytest.fixture
 def make_report(monkeypatch):
     """`python sweeps/report.py FLAGS` in this process; returns report.md. Figures are drawn only if asked for."""
@@ -149,8 +163,10 @@ def test_table_2(tmp_path, make_report):
                             "seeds", "steps"]  # fmt: skip
     assert rows["Reacher-v5"] == ["4.00 ± 1.41", "1.50 ± 0.71", "2.00", "-3.0", "-3.5", "-3.3", "2 / 2 / 1",
                                   "6,000,000"]  # fmt: skip
-    assert "Swimmer-v5" not in rows
+    assert "Swimmer-v5" not in rows and "K = 4; the paper's is 4" in section(text, "Table 2")
     missing = section(text, "What is missing")
+    names = "`Reacher-v5-2-uniform-1`, `Reacher-v5-2-uniform-2`"
+    assert f"Finished runs in no table:\n\n- Reacher-v5, RefinePPO, K = 2, uniform: {names}.\n\n" in missing
     assert re.search("Table 2, inverse: Reacher-v5: 1 of 5 seeds; no finished run of Ant-v5, HalfCheetah-v5,", missing)
 
 
@@ -252,14 +268,37 @@ def test_another_depth_stands_for_refineppo(tmp_path, make_report):
     assert [rows[task][3] for task in ("Hopper-v5", "Ant-v5")] == ["-", "+80.0"]
     rows = table(make_report(tmp_path / "runs", *out, "--depth", 2), "Table 1")
     assert [rows[task][3] for task in ("Hopper-v5", "Ant-v5")] == ["-", "+70.0"]
-    settings = tmp_path / "settings/refineppo"
-    settings.mkdir(parents=True)
-    (settings / "Hopper-v5.args").write_text("--gamma 0.9 # --refinement-depth 3\n--refinement-depth 8\n"
-                                             "--refinement-schedule=inverse")  # fmt: skip
-    rows = table(make_report(tmp_path / "runs", *out, "--settings", tmp_path / "settings"), "Table 1")
+    settings = make_settings(tmp_path, "refineppo", "Hopper-v5", "--ent-coef 0.1 # --refinement-depth 3\n"
+                             "--refinement-depth 8\n--refinement-schedule=inverse")  # fmt: skip
+    rows = table(make_report(tmp_path / "runs", *out, "--settings", settings), "Table 1")
     assert rows["task"][1] == "RefinePPO is"
     assert rows["Hopper-v5"][1:5] == ["RefinePPO, K = 8, inverse", "100 ± 0", "150 ± 0", "+50.0"]
     assert rows["Ant-v5"][1:5] == ["RefinePPO, K = 4, average", "100 ± 0", "180 ± 0", "+80.0"]
+
+
+def test_table_2_and_the_depth_figure_follow_the_settings(tmp_path, make_report):
+    """Each task's depth in Table 2 and schedule in Fig. 4 are those of its settings file; "/" is "_" in its name."""
+    runs, tasks = tmp_path / "runs", ("Hopper-v5", "my/Task-v0")
+    depths, schedules = dict(zip(tasks, (4, 8))), dict(zip(tasks, ("average", "inverse")))
+    for task, folder in zip(tasks, "ab"):
+        for i, schedule in enumerate(("average", "uniform", "inverse")):
+            make_run(runs, f"{folder}/{schedule}", task, 1, i, depth=depths[task], schedule=schedule)
+        for depth in {1, 2, 4, 8} - {depths[task]}:
+            make_run(runs, f"{folder}/{depth}", task, 1, 10 * depth, depth=depth, schedule=schedules[task])
+    make_run(runs, "other", "my/Task-v0", 1, 999, depth=4, schedule="average")
+    make_run(runs, "going", "my/Task-v0", 1, 999, depth=4, schedule="uniform", finished=False)
+    settings = make_settings(tmp_path, "refineppo", "my_Task-v0", "--refinement-depth 8 --refinement-schedule inverse")
+    text = make_report(runs, "--settings", settings)
+    rows = table(text, "Table 2")
+    assert rows["Hopper-v5"][:3] == ["0.00", "1.00", "2.00"] == rows["my/Task-v0"][:3]
+    assert "K = 4 (Hopper-v5), 8 (my/Task-v0); the paper's is 4" in section(text, "Table 2")
+    rows = table(text, "Fig. 4")
+    assert rows["Hopper-v5"][:4] == ["10.0", "20.0", "0.00", "80.0"]
+    assert rows["my/Task-v0"][:4] == ["10.0", "20.0", "40.0", "2.00"]
+    assert "Schedule: average (Hopper-v5), inverse (my/Task-v0). " in section(text, "Fig. 4")
+    missing = section(text, "What is missing")
+    assert "in no table:\n\n- my/Task-v0, RefinePPO, K = 4, average: `other`.\n\n" in missing
+    assert "Fig. 4, K = 2: Hopper-v5: 1 of 5 seeds; no finished run of Ant-v5" in missing
 
 
 # --- Folders ----------------------------------------------------------------------------------------------------------
@@ -281,7 +320,7 @@ def append(folder: Path, line: str):
 
 BAD_FOLDERS = {
     "torn config": (lambda folder: truncate(folder / "config.json"), "torn: config.json is not JSON"),
-    "no config": (lambda folder: (folder / "config.json").unlink(), "torn: there is no config.json"),
+    "no config": (lambda folder: (folder / "config.json").unlink(), "torn or foreign: there is no config"),
     "foreign config": (lambda folder: (folder / "config.json").write_text('{"model_type": "bert"}'), "foreign: "),
     "list as config": (lambda folder: (folder / "config.json").write_text("[1]"), "foreign: "),
     "binary config": (lambda folder: (folder / "config.json").write_bytes(b"\xff\xfe\x00"), "torn: config.json"),
@@ -316,14 +355,29 @@ def test_folders_that_cannot_be_used_are_named_with_the_reason(tmp_path, make_re
     (tmp_path / "notes/x.txt").touch()
     make_run(tmp_path / "tune/study/trial_0", "seed_1001", "Hopper-v5", 1001, best=999)
     (tmp_path / "tune/study/trials.csv").touch()
+    make_run(tmp_path / "tune/begun/trial_0", "seed_1001", "Hopper-v5", 1001, best=999)
+    (tmp_path / "tune/begun/journal.log").touch()
     lines = section(make_report(tmp_path), "What is missing").splitlines()
     for name, (_, reason) in BAD_FOLDERS.items():
         (line,) = [line for line in lines if line.startswith(f"- `deep/er/{name}`: ")]
         assert reason in line
     assert table((tmp_path / "report/report.md").read_text(), "Table 1")["Hopper-v5"][1] == "15.0 ± 7.1"
-    assert f"2 finished, 0 unfinished, {len(BAD_FOLDERS) + 1} skipped" in capsys.readouterr().out
-    assert any(line.startswith("- `tune/study`: a search") for line in lines)
+    assert f"2 finished, 0 unfinished, {len(BAD_FOLDERS) + 2} skipped" in capsys.readouterr().out
+    assert all(any(line.startswith(f"- `tune/{study}`: a search") for line in lines) for study in ("study", "begun"))
     assert not any("notes" in line for line in lines)
+
+
+def test_runs_of_other_programs_are_named(tmp_path, make_report, capsys):
+    """A lone checkpoint or TensorBoard log is no run of ours; TensorBoard's files below a run belong to it."""
+    make_seeds(tmp_path, "Hopper-v5", [10, 20])
+    for name in ("cleanrl/events.out.tfevents.1.host", "lone/best.pt", "Hopper-v5-None-average-1/events.out.tfevents.2",
+                 "Hopper-v5-None-average-1/hparams/deep/events.out.tfevents.3"):  # fmt: skip
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    missing = section(make_report(tmp_path), "What is missing")
+    reason = "torn or foreign: there is no config.json"
+    assert f"(skipped):\n\n- `cleanrl`: {reason}\n- `lone`: {reason}\n\n" in missing
+    assert "2 finished, 0 unfinished, 2 skipped" in capsys.readouterr().out
 
 
 def test_unfinished_runs_count_in_the_curves_alone(tmp_path, make_report):
@@ -375,6 +429,66 @@ def test_variants_and_duplicates_are_named(tmp_path, make_report):
         "- seed 1 again, beside `g/second`: `g/first`.",
     ):
         assert expected in lines
+
+
+def top(text: str) -> list[str]:
+    """The paragraphs between the report's title and its first words."""
+    return text.split("\n\n")[1 : text[: text.index("RefinePPO is K = ")].count("\n\n")]
+
+
+def test_the_flags_that_the_settings_ask_for_go_before_seeds_and_steps(tmp_path, make_report, monkeypatch):
+    """Tuned against tuned, though the default has more seeds and steps; SETTINGS is the default of --settings."""
+    runs, out = tmp_path / "runs", ("--out-dir", tmp_path / "out")
+    make_seeds(runs / "default", "Hopper-v5", [1, 2, 3], gamma=0.99, steps=10_000_000)
+    make_seeds(runs / "tuned", "Hopper-v5", [10], gamma=0.999, actor_hidden=[64, 32], anneal_lr=False, target_kl=0.02)
+    make_seeds(runs / "tuned", "Hopper-v5", [20], gamma=0.999, depth=4)
+    make_seeds(runs / "default", "Hopper-v5", [4, 5], gamma=0.99, depth=4)
+    settings = make_settings(tmp_path, "ppo", "Hopper-v5", "--gamma=0.999 # --gamma 0.9\n--actor-hidden 64 32\n"
+                             "--no-anneal-lr --target-kl 2e-2 --wandb-entity me --num_threads 2")  # fmt: skip
+    make_settings(tmp_path, "refineppo", "Hopper-v5", "--gamma 0.9 --gamma 0.999")
+    text = make_report(runs, *out, "--settings", settings)
+    assert table(text, "Table 1")["Hopper-v5"][1:3] == ["10.0", "20.0"] and top(text) == []
+    left_out = section(text, "What is missing").split("Duplicates and other variants (left out):")[1]
+    assert "- Hopper-v5, RefinePPO, K = 4, average, --gamma 0.99 (reported: 0.999): `default/Hopper-v5-4" in left_out
+    monkeypatch.setenv("SETTINGS", str(settings))
+    assert make_report(runs, *out) == text
+    text = make_report(runs, *out, "--settings", "none")
+    assert table(text, "Table 1")["Hopper-v5"][1:3] == ["2.00 ± 1.00", "4.50 ± 0.71"] and top(text) == []
+    monkeypatch.setenv("SETTINGS", "none")
+    assert make_report(runs, *out) == text
+    monkeypatch.setenv("SETTINGS", "")
+    assert report.Args(runs).settings == ROOT / "sweeps/settings"
+
+
+def test_other_flags_than_the_settings_ask_for_are_said_first(tmp_path, make_report):
+    """In every table: PPO, RefinePPO, other depths, the toy, which its generator gives flags; not what is not shown."""
+    runs = tmp_path / "runs"
+    make_seeds(runs, "Hopper-v5", [1, 2], gamma=0.999, num_envs=2, target_kl=None)
+    make_seeds(runs, "Hopper-v5", [3, 4], depth=4, anneal_lr=True)
+    make_seeds(runs, "Hopper-v5", [5, 6], depth=2, actor_hidden=[64, 64])
+    make_seeds(runs, "Hopper-v5", [7, 8], depth=2, schedule="uniform", gamma=0.9)
+    make_run(runs, "search", "Ant-v5", 1001)
+    make_run(runs, "toy", TOY, 1, num_envs=16, num_steps=64, num_minibatches=8, log_std_init=-2.0, eval_interval=1024,
+             eval_episodes=50)  # fmt: skip
+    make_run(runs, "toy 4", TOY, 1, depth=4, num_envs=1, eval_interval=1024)
+    settings = make_settings(tmp_path, "refineppo", "Hopper-v5", "--no-anneal-lr")
+    text = make_report(runs, "--settings", settings)
+    lines = "**Other flags than the settings ask for:** "
+    assert sorted(top(text)) == [
+        f"{lines}Hopper-v5, PPO: --gamma 0.999 (asked for: 0.99), --num-envs 2 (asked for: 1)",
+        f"{lines}Hopper-v5, RefinePPO, K = 2, average: --actor-hidden [64, 64] (asked for: [128, 128])",
+        f"{lines}Hopper-v5, RefinePPO, K = 4, average: --anneal-lr True (asked for: False)",
+        f"{lines}{TOY}, RefinePPO, K = 4, average: --num-envs 1 (asked for: 16)",
+        "**Seeds from 1001 on, of a search:** Ant-v5, PPO",
+    ]
+
+
+def test_the_scripts_defaults_are_read_as_they_are(script):
+    """Against the dataclass itself; only flags of a seed's own are left out."""
+    read = report.defaults(script.__name__.split("_")[0])
+    whole = json.loads(json.dumps(vars(script.Args())))
+    assert read == {name: value for name, value in whole.items() if name not in report.OWN_FLAGS}
+    assert {"gamma", "actor_hidden", "target_kl", "anneal_lr"} <= read.keys()
 
 
 def test_links(tmp_path, make_report):
@@ -637,6 +751,10 @@ BAD_INPUT = {
     "only torn runs": (lambda tmp: [occupied(tmp / "runs", "config.json", "{")], "torn: config.json is not JSON"),
     "depth": (lambda tmp: [runs_in(tmp / "runs"), "--depth", 0], "--depth must be at least 1"),
     "settings": (lambda tmp: [runs_in(tmp / "runs"), "--settings", tmp / "nothing"], "--settings must be a folder"),
+    "settings that are none": (
+        lambda tmp: [runs_in(tmp / "runs"), "--settings", make_settings(tmp, "ppo", "Hopper-v5", "--gamma high")],
+        "Hopper-v5.args: could not convert string to float: 'high'",
+    ),
     "foreign file": (lambda tmp: [runs_in(tmp / "runs"), "--out-dir", occupied(tmp / "out", "x")], "no report has"),
     "foreign report": (
         lambda tmp: [runs_in(tmp / "runs"), "--out-dir", occupied(tmp / "out", "report.md", "mine")], "no report has"),
@@ -664,6 +782,14 @@ def test_bad_input_is_refused(case, tmp_path, make_report, capsys):
     assert printed.err.startswith("report.py: error: ") and printed.err.count("\n") == 1 and expected in printed.err
     assert printed.out == ""
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_hidden_files_are_no_matter(tmp_path, make_report):
+    """Those that a file browser leaves, in a new folder or in one with a report."""
+    out = occupied(tmp_path / "out", ".DS_Store", "x")
+    make_report(runs_in(tmp_path / "runs"), "--out-dir", out)
+    make_report(tmp_path / "runs", "--out-dir", out)
+    assert (out / ".DS_Store").read_text() == "x"
 
 
 def test_a_report_with_an_added_file_is_refused(tmp_path, make_report):
