@@ -308,7 +308,8 @@ def test_batch_of_several_environments(script):
     terminated[1, 0] = terminated[2, 1] = truncated[2, 1] = truncated[1, 2] = True
     last = {end: np.array([0.7], "f") for end in ((1, 0), (2, 1), (1, 2))}
     roll = script.Rollout(obs=obs, next_obs=obs[1:], actions=actions, logprobs=logprobs, rewards=rewards.copy(),
-                          terminated=terminated, truncated=truncated, final_obs=last, episodes=[])  # fmt: skip
+                          terminated=terminated, truncated=truncated, final_obs=last, first_obs={},
+                          episodes=[])  # fmt: skip
     expected_rewards = script.Normalizer(3, 1, agent.args).scale_rewards(rewards, terminated)
     expected_rewards[1, 2] += 0.9 * (3 * math.tanh(0.7 / 2) + 1)
     values = 3 * np.tanh(obs[..., 0] / 2) + 1

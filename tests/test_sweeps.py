@@ -26,7 +26,7 @@ from sweeps.toy_env import phi, psi
 
 MUJOCO = TASKS[:9]
 TINY = "--no-compile --num-steps 32 --num-minibatches 2 --update-epochs 1 --actor-hidden 16 --critic-hidden 16"
-TINY += " --eval-interval 64 --eval-episodes 1 --final-eval-episodes 1 --checkpoint-interval 32"
+TINY += " --eval-interval 640 --eval-episodes 1 --final-eval-episodes 1 --checkpoint-interval 32"
 
 
 def environment(folder: Path, **settings) -> dict:
@@ -300,15 +300,15 @@ def tiny_sweep(folder: Path) -> tuple[list[str], Path]:
         file.parent.mkdir(parents=True)
         file.write_text(TINY)
     lines = generate(folder, "benchmark.sh", "Pendulum-v1", SETTINGS="tiny", STEPS="64", RUNS_DIR="runs")
-    long = lines[0].replace("--total-timesteps 64", "--total-timesteps 16000")
+    long = lines[0].replace("--total-timesteps 64", "--total-timesteps 24000")
     return [long, *lines[1:], "python no_such_script.py --run-dir runs/broken"], Path(parse(long).run_dir)
 
 
-def wait_until(condition, timeout=300):
+def wait_until(condition, timeout=300, pause=0.05):
     end = time.time() + timeout
     while not condition():
         assert time.time() < end, "it did not happen in time"
-        time.sleep(0.05)
+        time.sleep(pause)
 
 
 def training_of(run_dir: Path) -> int | None:
@@ -344,6 +344,7 @@ def test_a_local_sweep_is_killed_stopped_and_continued(engine, tmp_path):
     command = [str(ROOT / "sweeps" / "run_local.sh"), "-j", "2", "jobs"]
     pid, terminal = pty.fork()
     if not pid:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # ignored where the tests run in the background
         os.chdir(tmp_path)
         os.execve(command[0], command, environment(tmp_path))
     run_dir = tmp_path / long
@@ -393,6 +394,16 @@ def test_a_slurm_sweep_is_preempted_requeued_and_finished(tmp_path):
     def state(task: str, name="JobState") -> str:
         return re.search(rf"{name}=(\w+)", slurm("scontrol", "show", "job", task))[1]
 
+    def queued(*flags) -> list[str]:
+        return slurm("squeue", "--noheader", "--array", "--format=%i", f"--job={job}", *flags).split()
+
+    def hurry() -> bool:
+        """Slurm lets a requeued job wait for two minutes, and holds it if the node was not ready for it."""
+        for waiting in queued("--states=PD"):
+            subprocess.run(["scontrol", "release", waiting], capture_output=True)
+            subprocess.run(["scontrol", "update", f"JobId={waiting}", "StartTime=now"], capture_output=True)
+        return True
+
     submitted = shell(tmp_path, "run_slurm.sh", "--steps-per-task", 128, "--max-running", 3, stdin="\n".join(lines))
     job = re.match(r"submitted job (\d+): 11 jobs in 7 tasks", submitted.stdout)[1]
     task = f"{job}_1"
@@ -402,21 +413,16 @@ def test_a_slurm_sweep_is_preempted_requeued_and_finished(tmp_path):
     high = slurm("sbatch", "--parsable", "--partition=high", "--exclusive", "--wrap=true").strip()
     wait_until(lambda: state(high) == "COMPLETED")
     wait_until(lambda: state(task) == "PENDING")
-    assert state(task, "Restarts") == "1"
-    slurm("scontrol", "update", f"JobId={task}", "StartTime=now")  # Slurm lets a requeued job wait for two minutes
+    assert int(state(task, "Restarts")) >= 1
 
     # Signalled, as before the time limit
     before = saves(run_dir)
-    wait_until(lambda: saves(run_dir) > before)
+    wait_until(lambda: hurry() and saves(run_dir) > before, pause=0.5)
     slurm("scancel", "--batch", "--signal=USR1", task)
     wait_until(lambda: state(task) == "PENDING")
-    assert state(task, "Restarts") == "2" and not (run_dir / "result.json").exists()
-    slurm("scontrol", "update", f"JobId={task}", "StartTime=now")
+    assert int(state(task, "Restarts")) >= 2 and not (run_dir / "result.json").exists()
 
-    wait_until(lambda: not slurm("squeue", "--noheader", f"--job={job}", "--states=R") and state(task) == "COMPLETED")
-    for waiting in slurm("squeue", "--noheader", "--array", "--format=%i", f"--job={job}").split():
-        slurm("scontrol", "update", f"JobId={waiting}", "StartTime=now")  # preempted as well
-    wait_until(lambda: not slurm("squeue", "--noheader", f"--job={job}"))
+    wait_until(lambda: hurry() and not queued(), pause=1)
     assert [state(f"{job}_{i}") for i in range(1, 8)] == ["COMPLETED"] * 6 + ["FAILED"]
     assert joblog(tmp_path)[lines[0]][-1] == 0 and joblog(tmp_path)[lines[-1]] == [2]
     assert "failed (exit 2): runs/broken.log" in (tmp_path / "runs" / "slurm" / f"{job}_7.log").read_text()
