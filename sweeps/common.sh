@@ -58,17 +58,14 @@ read_settings() {
     IFS=$' \t\r\n' read -r -d '' -a words < <(sed 's/#.*//' "$file") || true
     for ((i = 0; i < ${#words[@]}; i++)); do
         case ${words[i]} in
-            --refinement-depth | --refinement-schedule)
-                [ $((i + 1)) -lt ${#words[@]} ] || refuse "$file: ${words[i]} lacks its value" ;;
-        esac
-        case ${words[i]} in
             --*[=_]*) refuse "$file: write ${words[i]} with dashes and a blank, as in --num-envs 4" ;;
             --env-id | --seed | --total-timesteps | --run-dir) refuse "$file: ${words[i]} is the sweep's own" ;;
-            --refinement-depth) depth=${words[++i]} ;;
-            --refinement-schedule) schedule=${words[++i]} ;;
+            --refinement-depth) depth=${words[++i]-} ;;
+            --refinement-schedule) schedule=${words[++i]-} ;;
             *) flags+=" ${words[i]}" ;;
         esac
     done
+    [ "$depth" ] && [ "$schedule" ] || refuse "$file: --refinement-depth or --refinement-schedule lacks its value"
 }
 
 # job ALGORITHM TASK SEED [DEPTH [SCHEDULE]]: one run's command. DEPTH and SCHEDULE come from the settings where left
