@@ -176,6 +176,15 @@ ARRAY_OPS = np.ndarray.dot, np.tanh  # dot: on small arrays half the time of @
 TENSOR_OPS = torch.mm, torch.tanh
 
 
+def network(weights: list[tuple], x):
+    """A tanh network, (batch, inputs) to (batch, outputs), in arrays or tensors; `weights` are its (weight, bias)."""
+    dot, tanh = ARRAY_OPS if isinstance(x, np.ndarray) else TENSOR_OPS
+    *hidden, (w_out, b_out) = weights
+    for w, b in hidden:
+        x = tanh(dot(x, w) + b)
+    return dot(w_out.T, x.T).T + b_out  # x w_out: BLAS is faster with the narrow side first
+
+
 def refinement_coefficients(schedule: str, depth: int) -> list[float]:
     """c_1, ..., c_K of the paper's three schedules; for K = 1 all are [1]."""
     schedules = {"average": lambda k: 1 / depth, "uniform": lambda k: 1.0, "inverse": lambda k: 1 / k}
@@ -199,18 +208,10 @@ def proposals(weights: list[tuple], coefficients: list[float], obs) -> list:
         x = tanh(state_share if m is None else state_share + dot(m, w_m))  # m_0 = 0
         for w, b in hidden:
             x = tanh(dot(x, w) + b)
-        correction = c * (dot(w_out.T, x.T).T + b_out)  # x w_out: BLAS is faster with the narrow side first
+        correction = c * (dot(w_out.T, x.T).T + b_out)
         m = correction if m is None else m + correction
         all_m.append(m)
     return all_m
-
-
-def critic_value(weights: list[tuple], obs: torch.Tensor) -> torch.Tensor:
-    """V(s), (batch,), of normalised observations (batch, obs_dim)."""
-    *hidden, (w_out, b_out) = weights
-    for w, b in hidden:
-        obs = torch.tanh(obs @ w + b)
-    return (w_out.T @ obs.T).squeeze(0) + b_out
 
 
 def init_params(sizes: dict[str, list[int]], args: Args) -> dict[str, torch.Tensor]:
@@ -259,9 +260,8 @@ class Agent:
         self.normalizer = Normalizer(args.num_envs, obs_dim, args)
 
     def act(self, obs: np.ndarray) -> np.ndarray:
-        """The deterministic action m_K, clipped to the action bounds, of raw observations: (obs_dim,) or (n, obs_dim).
-
-        Algorithm 1, line 10, says a = m_K; training clips its actions too, as CleanRL does.
+        """The deterministic action of raw observations, (obs_dim,) or (n, obs_dim): the policy's mean (Algorithm 1,
+        line 10), clipped to the action bounds, as training clips its actions and CleanRL does.
         """
         return np.clip(self.proposals(obs)[-1], self.low, self.high)
 
@@ -473,7 +473,7 @@ class Batch(NamedTuple):
 
 
 def collect(agent: Agent, envs: Environments, num_steps: int, rng: np.random.Generator) -> Rollout:
-    """Act with a = m_K + exp(log_std) * noise; what acting does not need, as the values, is computed later, at once.
+    """Act with a = mean + exp(log_std) * noise; what acting does not need, as the values, is computed later, at once.
 
     The actor runs in NumPy: for one observation torch's overhead per call is larger than the arithmetic.
     """
@@ -481,7 +481,7 @@ def collect(agent: Agent, envs: Environments, num_steps: int, rng: np.random.Gen
     weights, log_std, obs = layers(arrays, "actor"), arrays["log_std"], agent.normalizer.normalize(envs.obs)
     noise = rng.standard_normal((num_steps, len(obs), len(log_std)), dtype=np.float32)
     perturbation = noise * np.exp(log_std)
-    # the density of a depends on the noise alone: a - m_K = exp(log_std) * noise
+    # the density of a depends on the noise alone: a - mean = exp(log_std) * noise
     logprobs = -(0.5 * noise**2 + log_std + 0.5 * math.log(2 * math.pi)).sum(-1)
     all_obs, actions = np.empty((num_steps + 1, *obs.shape), np.float32), np.empty_like(noise)
     outcomes, final_obs, episodes = [], {}, []
@@ -514,12 +514,12 @@ def prepare_batch(agent: Agent, rollout: Rollout) -> tuple[Batch, float]:
     """A rollout's transitions for `learn`, and the explained variance of the value function."""
     args, weights = agent.args, layers(agent.params, "critic")
     obs = torch.from_numpy(rollout.obs).to(agent.device)
-    values = critic_value(weights, obs.flatten(0, 1)).view(obs.shape[:2]).cpu().numpy()
+    values = network(weights, obs.flatten(0, 1)).view(obs.shape[:2]).cpu().numpy()
     rewards = agent.normalizer.scale_rewards(rollout.rewards, rollout.terminated)
     cut = [at for at in rollout.final_obs if not rollout.terminated[at]] if args.bootstrap_truncated else []
     if cut:
         final_obs = torch.from_numpy(np.stack([rollout.final_obs[at] for at in cut])).to(agent.device)
-        for at, value in zip(cut, critic_value(weights, final_obs).tolist()):
+        for at, value in zip(cut, network(weights, final_obs).squeeze(1).tolist()):
             rewards[at] += args.gamma * value
     advantages = gae(rewards, values, rollout.terminated | rollout.truncated, args.gamma, args.gae_lambda)
     returns = advantages + values[:-1]
@@ -547,7 +547,7 @@ def ppo_loss(params: dict, args: Args, batch: Batch) -> tuple[torch.Tensor, torc
     clipped_ratio = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
     policy_loss = -torch.minimum(advantages * ratio, advantages * clipped_ratio).mean()
 
-    values = critic_value(layers(params, "critic"), batch.obs)
+    values = network(layers(params, "critic"), batch.obs).squeeze(1)
     value_errors = (values - batch.returns) ** 2
     if args.clip_vloss:
         clipped_values = batch.values + (values - batch.values).clamp(-args.clip_coef, args.clip_coef)
@@ -639,7 +639,7 @@ class Training:
     """All that training changes, and so all that last.pt holds."""
 
     def __init__(self, args: Args):
-        seed_global_rng(args.seed)
+        seed_global_rng(*episode_seeds(args.seed, 2, 0))
         self.envs = Environments(args)
         self.agent = Agent(self.envs.envs[0].observation_space, self.envs.envs[0].action_space, args)
         self.agent.normalizer.observe(self.envs.obs)
@@ -649,14 +649,13 @@ class Training:
 
     def state(self) -> dict:
         parts = {"adam": self.adam.state(), "envs": self.envs.state(), "rng": self.rng.bit_generator.state}
-        return self.agent.state() | parts | {"global_rng": global_rng_state(), "progress": asdict(self.progress)}
+        return self.agent.state() | parts | {"progress": asdict(self.progress)}
 
     def load(self, state: dict):
         self.agent.load(state)
         self.adam.load(state["adam"])
         self.envs.load(state["envs"])
         self.rng.bit_generator.state = state["rng"]
-        set_global_rng(state["global_rng"])  # after the replay, which may draw from it
         self.progress = Progress(**state["progress"])
 
 
@@ -670,9 +669,10 @@ def main():
         training = run.begin_or_resume()
         agent, envs, progress = training.agent, training.envs, training.progress
         update_function = run.compile(training)
-        run.evaluate_if_due(training)  # due here if the run was stopped in the middle of it
+        run.evaluate_if_due(agent)  # due here if the run was stopped in the middle of it
         while progress.global_step < args.last_step:
             start, before = time.time(), progress.global_step
+            seed_global_rng(*episode_seeds(args.seed, 2, before))
             rollout = collect(agent, envs, args.num_steps, training.rng)
             batch, explained_variance = prepare_batch(agent, rollout)
             learning_rate = args.learning_rate * (1 - before / args.last_step if args.anneal_lr else 1)
@@ -684,17 +684,17 @@ def main():
             scalars["charts/learning_rate"] = learning_rate
             scalars["charts/SPS"] = step / progress.train_seconds
             scalars |= refinement_scalars(agent, batch.obs)
-            run.log(training, scalars, [(before + offset, *episode) for offset, *episode in rollout.episodes])
-            run.evaluate_if_due(training)
+            run.log(scalars, [(before + offset, *episode) for offset, *episode in rollout.episodes])
+            run.evaluate_if_due(agent)
             if passed(args.save_every, before, step):
-                run.save(f"step_{step}.pt", training)
+                run.save(f"step_{step}.pt", agent)
             if passed(args.checkpoint_interval, before, step) or step == args.last_step or stop_signals:
                 run.save_last(training)
                 run.exit_if_stopped()
-        run.finish(training)
+        run.finish(agent)
 
 
-# --- Nothing below is the algorithm: logs, evaluation, tasks, arguments, compilation, files and signals ---------------
+# --- Nothing below is the algorithm: evaluation, the task's boundary, arguments, compilation, files, signals ----------
 
 
 def passed(interval: int | None, before: int, now: int) -> bool:
@@ -723,28 +723,24 @@ def refinement_scalars(agent: Agent, obs: torch.Tensor) -> dict[str, float]:
 def evaluate(agent: Agent, seeds: list[int], render_mode: str | None = None, videos: Path | None = None):
     """Returns and lengths, (len(seeds),), of one episode per seed, acting with `agent.act` in new environments.
 
-    The normalizer is frozen, and no random stream of the training is touched. The episodes run side by side, in a
-    window one after the other. A signal ends it at once, with what there is.
+    The normalizer is frozen, and no random stream of the training is touched. A signal ends it with what there is.
     """
-    returns, lengths, rng_state = np.zeros(len(seeds)), np.zeros(len(seeds), int), global_rng_state()
+    returns, lengths = np.zeros(len(seeds)), np.zeros(len(seeds), int)
     seed_global_rng(seeds[0])
-    groups = [[i] for i in range(len(seeds))] if render_mode == "human" else [range(len(seeds))]
-    for group in groups:
-        envs = {i: make_env(agent.args, render_mode, evaluation_episode=i) for i in group}
-        if videos:
-            options = {"video_folder": str(videos), "episode_trigger": lambda _: True, "disable_logger": True}
-            envs = {i: gym.wrappers.RecordVideo(env, name_prefix=f"episode-{i}", **options) for i, env in envs.items()}
-        obs = {i: env.reset(seed=seeds[i])[0] for i, env in envs.items()}
-        while obs and not stop_signals:
-            for i, action in zip(list(obs), agent.act(np.stack(list(obs.values())))):
-                obs[i], reward, terminated, truncated, _ = envs[i].step(action)
-                returns[i] += reward
-                lengths[i] += 1
-                if terminated or truncated:
-                    del obs[i]
-        for env in envs.values():
-            env.close()
-    set_global_rng(rng_state)
+    envs = [make_env(agent.args, render_mode, evaluation_episode=i) for i in range(len(seeds))]
+    if videos:
+        recorded = {"video_folder": str(videos), "episode_trigger": lambda _: True, "disable_logger": True}
+        envs = [gym.wrappers.RecordVideo(env, name_prefix=f"seed-{seed}", **recorded) for env, seed in zip(envs, seeds)]
+    obs = {i: env.reset(seed=seed)[0] for i, (env, seed) in enumerate(zip(envs, seeds))}  # of episodes that go on
+    while obs and not stop_signals:
+        for i, action in zip(list(obs), agent.act(np.stack(list(obs.values())))):
+            obs[i], reward, terminated, truncated, _ = envs[i].step(action)
+            returns[i] += reward
+            lengths[i] += 1
+            if terminated or truncated:
+                del obs[i]
+    for env in envs:
+        env.close()
     return returns, lengths
 
 
@@ -761,7 +757,7 @@ def mean_and_std(x) -> tuple[float, float]:
 
 def evaluate_checkpoint(given: Args):
     """--evaluate: print a saved policy's returns, which for best.pt and last.pt are those in result.json."""
-    path, render_mode = Path(given.evaluate).expanduser(), "human" if given.render else None
+    path = Path(given.evaluate).expanduser()
     checkpoint = load_checkpoint(path)
     own = ("evaluate", "final_eval_episodes", "render", "capture_video", "num_threads", "cuda")
     args = replace(Args(**checkpoint["args"]), **{name: getattr(given, name) for name in own})
@@ -769,17 +765,19 @@ def evaluate_checkpoint(given: Args):
     videos = path.with_suffix(".videos") if args.capture_video else None
     if videos and videos.exists():
         refuse(f"{videos} exists already; move it away to record again")
-    seeds = evaluation_seeds(args, checkpoint["global_step"], final=True)
-    returns, lengths = evaluate(agent_of(checkpoint, args), seeds, "rgb_array" if videos else render_mode, videos)
+    render_mode = "human" if args.render else "rgb_array" if videos else None
+    agent, seeds = agent_of(checkpoint, args), evaluation_seeds(args, checkpoint["global_step"], final=True)
+    together = [[seed] for seed in seeds] if args.render else [seeds]  # one window after the other
+    returns, lengths = np.hstack([evaluate(agent, some, render_mode, videos) for some in together])
     for i, (episode_return, length) in enumerate(zip(returns, lengths), start=1):
-        say(f"episode {i}: return {episode_return:.3f}, length {length}")
+        say(f"episode {i}: return {episode_return:.3f}, length {length:.0f}")
     mean, std = mean_and_std(returns)
     say(f"step {checkpoint['global_step']:,}: mean return {mean:.3f}, std {std:.3f} (ddof 1)")
     if videos:
         say(f"videos are in {videos}")
 
 
-# --- The boundary between a task and everything else ------------------------------------------------------------------
+# The boundary between a task and everything else
 
 mujoco_warnings: list[str] = []  # where MuJoCo reports an unstable simulation, which it otherwise hides
 mujoco.set_mju_user_warning(mujoco_warnings.append)
@@ -869,41 +867,31 @@ def make_env(args: Args, render_mode: str | None = None, **facts) -> Task:
 
 
 def episode_seeds(seed: int, *key: int, count: int = 1) -> list[int]:
-    """Seeds for `env.reset`, a stream of its own for every key: (0, env, episode) trains, (1, step) evaluates.
+    """Seeds of 31 bits (some simulators keep theirs in a C int), a stream of its own for every key.
 
-    They have 31 bits, since some simulators keep theirs in a C int.
+    (0, env, episode) trains, (1, global_step) evaluates, (2, global_step) is for the global generators.
     """
     return (np.random.SeedSequence(seed, spawn_key=key).generate_state(count) >> 1).tolist()
 
 
 def seed_global_rng(seed: int):
-    """The generators that a task may draw from beside its own: Python's, NumPy's and torch's."""
+    """Python's, NumPy's and torch's global generators: a task may draw from them, nothing here does.
+
+    Seeded anew before each rollout and each evaluation, they are the same in a resumed run.
+    """
     random.seed(seed)
-    np.random.seed(seed % 2**32)
+    np.random.seed(seed)
     torch.manual_seed(seed)
 
 
-def global_rng_state() -> dict:
-    name, keys, *rest = np.random.get_state()
-    return {"python": random.getstate(), "numpy": (name, keys.tolist(), *rest), "torch": torch.get_rng_state()}
-
-
-def set_global_rng(state: dict):
-    random.setstate(state["python"])
-    np.random.set_state(state["numpy"])
-    torch.set_rng_state(state["torch"])
-
-
-# --- Arguments --------------------------------------------------------------------------------------------------------
+# Arguments
 
 SCRIPT = Path(__file__).name
 EXIT_BAD_ARGUMENTS, EXIT_FAILURE, EXIT_STOPPED = 2, 3, 75
 POSITIVE, FRACTION = ("positive", lambda x: 0 < x < math.inf), ("between 0 and 1", lambda x: 0 <= x <= 1)
-RULES = {
-    **{int: ("at least 1", lambda x: x >= 1), float: ("a finite number", math.isfinite)},  # by type, and by name
-    **{"seed": ("from 0 to 2^63 - 1", lambda x: 0 <= x < 2**63), "gamma": FRACTION, "gae_lambda": FRACTION},
-    **dict.fromkeys(("learning_rate", "clip_coef", "max_grad_norm", "target_kl"), POSITIVE),
-}
+RULES = {"seed": ("from 0 to 2^63 - 1", lambda x: 0 <= x < 2**63), "gamma": FRACTION, "gae_lambda": FRACTION}
+RULES |= dict.fromkeys(("learning_rate", "clip_coef", "max_grad_norm", "target_kl"), POSITIVE)
+RULES_BY_TYPE = {int: ("at least 1", lambda x: x >= 1), float: ("a finite number", math.isfinite)}
 
 
 def say(text: str):
@@ -925,12 +913,26 @@ def first_line(error: BaseException) -> str:
     return next(iter(str(error).strip().splitlines()), type(error).__name__)
 
 
+@contextmanager
+def refusing(sentence: str):
+    """What fails in the block is refused; an error that arose in the task's own code keeps its traceback."""
+    try:
+        yield
+    except NotFinite:
+        raise
+    except Exception as error:  # whatever gymnasium or the task raises
+        innermost = Path(traceback.extract_tb(error.__traceback__)[-1].filename)
+        if Path(gym.__file__).parent not in innermost.parents and innermost != Path(__file__):
+            traceback.print_exception(error)
+        refuse(f"{sentence}: {first_line(error)}")
+
+
 def check_args(args: Args):
     """Refuse what cannot be trained or evaluated before any work starts; limit the threads, on which bits depend."""
     for flag in fields(args):
         value, name = getattr(args, flag.name), flag.name.replace("_", "-")
         for x in value if isinstance(value, tuple) else (value,):
-            rule, holds = RULES.get(flag.name) or RULES.get(type(x)) or ("", lambda x: True)
+            rule, holds = RULES.get(flag.name) or RULES_BY_TYPE.get(type(x)) or ("", lambda x: True)
             if x is not None and not holds(x):
                 refuse(f"--{name} must be {rule}, not {value}")
         if value == ():
@@ -958,64 +960,44 @@ def check_args(args: Args):
 
 def check_task(args: Args):
     """Refuse a task that breaks the rules of gymnasium's Env, or cannot be drawn; warn of what else is doubtful."""
-    render_mode = "human" if args.render else "rgb_array" if args.capture_video else None
-    with refusing(f"cannot make the task {args.env_id}"), warnings.catch_warnings(action="ignore"):
+    task_id, render_mode = args.env_id, "human" if args.render else "rgb_array" if args.capture_video else None
+    with refusing(f"cannot make the task {task_id}"), warnings.catch_warnings(action="ignore"):
         task = make_env(args, render_mode)  # its warnings are shown again when training makes its environments
     actions, problems = task.action_space, []
     if not (isinstance(actions, gym.spaces.Box) and len(actions.shape) == 1 and actions.dtype.kind == "f"):
-        refuse(f"{args.env_id} has actions in {actions}; only a one-dimensional Box of real numbers is supported")
+        refuse(f"{task_id} has actions in {actions}; only a one-dimensional Box of real numbers is supported")
     with warnings.catch_warnings(record=True, action="always") as notes:
         try:
             check_env(task.unwrapped, skip_render_check=True, skip_close_check=True)
         except (Exception, SystemExit) as error:  # whatever the checker or the task raises
-            problems.append(first_line(error))
+            problems = [first_line(error)]
     problems += [str(note.message).partition("WARN: ")[2].removesuffix("\x1b[0m") for note in notes]
-    ours = ("infinity", "symmetric and normalized", "dtype")  # infinite bounds, ranges of actions, types of numbers
+    fine = ("infinity", "symmetric and normalized", "dtype")  # infinite bounds, ranges of actions, types of numbers
     for problem in dict.fromkeys(problems):
-        if problem and not any(words in problem for words in ours):
-            say(f"warning: gymnasium's check_env says of {args.env_id}: {problem}")
-    with refusing(f"{args.env_id} does not work as gymnasium's Env should"), suppress(NotFinite):  # training says where
-        task.reset(seed=episode_seeds(args.seed, 2)[0])
+        if problem and not any(words in problem for words in fine):
+            say(f"warning: gymnasium's check_env says of {task_id}: {problem}")
+    with refusing(f"{task_id} does not work as gymnasium's Env should"), suppress(NotFinite):  # training says where
+        task.reset(seed=args.seed % 2**31)
         task.step(actions.sample())
     if render_mode:
-        with refusing(f"cannot draw {args.env_id} (MUJOCO_GL=egl or MUJOCO_GL=osmesa draws without a screen)"):
+        with refusing(f"cannot draw {task_id} (MUJOCO_GL=egl or MUJOCO_GL=osmesa draws without a screen)"):
             if task.render() is None and render_mode == "rgb_array":
                 raise ValueError("it gives no pictures as rgb_array")
     others = f"training keeps {args.num_envs}, and an evaluation makes {args.eval_episodes} more"
-    with refusing(f"cannot make {args.env_id} a second time beside the first ({others})"):
+    with refusing(f"cannot make {task_id} a second time beside the first ({others})"):
         make_env(args).close()
     task.close()
     std = math.exp(args.log_std_init)
-    reach = [
-        math.erf(high / std / 2**0.5) - math.erf(low / std / 2**0.5) for low, high in zip(actions.low, actions.high)
-    ]
-    if min(reach) < 0.02:
-        say(
-            f"warning: {args.env_id} has actions in {actions}, where a policy that starts as Normal(0, {std:.2g}) "
-            "hardly ever gets; rescale them to -1 .. 1 with gymnasium's RescaleAction"
-        )
-    if task.spec.max_episode_steps is None and not args.evaluate:
-        say(
-            f"warning: {args.env_id} has no time limit: evaluations wait for their episodes to end, and "
-            "--resume replays the running one, however long; --max-episode-steps sets a limit"
-        )
+    bounds = zip((actions.low / std).tolist(), (actions.high / std).tolist())
+    if min(math.erf(high / 2**0.5) - math.erf(low / 2**0.5) for low, high in bounds) < 0.02:
+        start = f"a policy that starts as Normal(0, {std:.2g}) hardly ever gets there"
+        say(f"warning: {task_id} has actions in {actions}; {start}: rescale them with gymnasium's RescaleAction")
+    if task.spec.max_episode_steps is None:
+        wait = "evaluations wait for their episodes to end, and --resume replays the running one"
+        say(f"warning: {task_id} has no time limit: {wait}; --max-episode-steps sets a limit")
 
 
-@contextmanager
-def refusing(sentence: str):
-    """What fails in the block is refused; an error that arose in the task's own code keeps its traceback."""
-    try:
-        yield
-    except NotFinite:
-        raise
-    except Exception as error:  # whatever gymnasium or the task raises
-        innermost = Path(traceback.extract_tb(error.__traceback__)[-1].filename)
-        if Path(gym.__file__).parent not in innermost.parents and innermost != Path(__file__):
-            traceback.print_exception(error)
-        refuse(f"{sentence}: {first_line(error)}")
-
-
-# --- Compilation ------------------------------------------------------------------------------------------------------
+# Compilation
 
 
 def compile_update(training: Training):
@@ -1053,9 +1035,8 @@ def compile_update(training: Training):
             with tempfile.TemporaryDirectory() as folder, fresh_cache(dir=folder):
                 compiled = compile_and_run()
     except Exception as error:  # no C++ compiler, no Python headers, ...: whatever it is, training can go on
-        lines = str(error).splitlines()
-        line = next((line for line in lines if " error: " in line), first_line(error))  # the C++ compiler's own
-        say(f"compilation failed, training goes on uncompiled: {line}")
+        lines = (line for line in str(error).splitlines() if " error: " in line)  # the C++ compiler's own
+        say(f"compilation failed, training goes on uncompiled: {next(lines, first_line(error))}")
         return None
     for x, old in zip(tensors, before):
         x.copy_(old)
@@ -1066,7 +1047,7 @@ def compile_update(training: Training):
     return compiled
 
 
-# --- Checkpoints ------------------------------------------------------------------------------------------------------
+# Checkpoints
 
 
 def write_atomically(path: Path, data: bytes):
@@ -1134,6 +1115,12 @@ def agent_of(checkpoint: dict, args: Args) -> Agent:
     return agent
 
 
+# The run's folder
+
+FREE_ON_RESUME = {"resume", "run_dir", "progress", "track", "capture_video", "checkpoint_interval", "save_every"}
+RESUMED = {"adam", "envs", "rng", "progress", "compiled", "machine"}  # in last.pt alone
+
+
 def describe_machine() -> dict:
     """Versions, commit and hardware: what the numbers of a run may depend on beside its flags."""
     git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
@@ -1148,12 +1135,6 @@ def describe_machine() -> dict:
     }
 
 
-# --- The run's folder -------------------------------------------------------------------------------------------------
-
-FREE_ON_RESUME = {"resume", "run_dir", "progress", "track", "capture_video", "checkpoint_interval", "save_every"}
-RESUMED = {"adam", "envs", "rng", "global_rng", "progress", "compiled", "machine"}  # in last.pt alone
-
-
 class Run:
     """The folder of a run: locked while it is at work, never overwritten; what is written there, and how it ends."""
 
@@ -1162,8 +1143,8 @@ class Run:
         self.args, self.dir = args, Path(args.run_dir or name).expanduser()
         self.machine, self.clock, self.compiled = describe_machine(), time.time(), False
         self.last_return = self.last_evaluation = "-"  # shown by the progress bar
-        self.stack = ExitStack()  # all that is to be closed, however the run ends
-        self.training: Training | None = None
+        self.stack = ExitStack()  # what is to be closed, however the run ends
+        self.progress = Progress()
         try:
             self.dir.mkdir(parents=True, exist_ok=True)
             self.lock()
@@ -1179,11 +1160,11 @@ class Run:
         lock = filelock.FileLock(self.dir / ".lock")
         try:
             lock.acquire(blocking=False)
+            self.stack.callback(lock.release)
         except filelock.Timeout:
             refuse(f"another process is at work in {self.dir}")
         except NotImplementedError:  # this file system has no locks
-            return
-        self.stack.callback(lock.release)
+            pass
 
     def find_checkpoint(self) -> dict | None:
         """last.pt, if the run can go on from there; exits if it is finished, refuses if it is another one's."""
@@ -1211,10 +1192,9 @@ class Run:
         begun = saved["machine"]
         if begun["versions"] != self.machine["versions"]:
             refuse(f"the run in {self.dir} can be continued exactly with its own versions only: {begun['versions']}")
-        if begun["cpu"] != self.machine["cpu"]:
-            say(f"warning: begun on {begun['cpu']}; on {self.machine['cpu']} the last bits of its numbers may differ")
-        if begun["git_commit"] != self.machine["git_commit"]:
-            say(f"warning: begun with the code of commit {begun['git_commit']}, which is another one now")
+        for name in ("cpu", "git_commit"):
+            if begun[name] != self.machine[name]:
+                say(f"warning: begun with {name} {begun[name]}, now {self.machine[name]}: its numbers may differ")
         return saved
 
     def __enter__(self):
@@ -1224,42 +1204,40 @@ class Run:
         """Close everything; where a number was not finite, say which, where and when, and leave what was saved."""
         self.stack.close()
         if isinstance(error, NotFinite):
-            facts = error.facts | {"global_step": self.training.progress.global_step if self.training else 0}
-            facts["mujoco_warnings"] = mujoco_warnings[:5]
+            facts = error.facts | {"global_step": self.progress.global_step, "mujoco_warnings": mujoco_warnings[:5]}
             write_atomically(self.dir / "failure.json", json.dumps(facts, indent=2).encode())
-            failure = self.dir / "failure.json"
-            print(f"{SCRIPT}: numerical failure: {facts} (also in {failure})", file=sys.stderr)
+            failure = f"numerical failure: {facts} (also in {self.dir / 'failure.json'})"
+            print(f"{SCRIPT}: {failure}", file=sys.stderr)
             raise SystemExit(EXIT_FAILURE)
 
     def begin_or_resume(self) -> Training:
         """The training, as it was when last.pt was saved; and its logs, where what followed it is dropped."""
-        args, saved = self.args, self.checkpoint
-        training = self.training = Training(args)
+        training, saved = Training(self.args), self.checkpoint
         if saved:
             training.load(saved)
-        progress = training.progress
-        self.write_evaluations(progress)
-        if args.track:
-            self.track(progress)
+        progress = self.progress = training.progress
+        self.write_evaluations()
+        if self.args.track:
+            self.track()
         self.writer = SummaryWriter(self.dir, purge_step=progress.global_step + 1 if saved else None)
         self.stack.callback(self.writer.close)
         if not saved:
             self.log_hyperparameters()
-        shown = None if args.progress else True  # None: on a terminal
-        self.bar = tqdm(total=args.last_step, unit=" steps", unit_scale=True, smoothing=0.05, disable=shown)
+        shown = None if self.args.progress else True  # None: on a terminal
+        self.bar = tqdm(total=self.args.last_step, unit=" steps", unit_scale=True, smoothing=0.05, disable=shown)
         self.bar.update(progress.global_step)
         self.stack.callback(self.bar.close)
         return training
 
-    def track(self, progress: Progress):
+    def track(self):
         """Weights & Biases shows what TensorBoard is given; a resumed run goes on in the same place."""
         import wandb  # an optional extra
 
-        progress.wandb_id = progress.wandb_id or wandb.util.generate_id()
+        self.progress.wandb_id = self.progress.wandb_id or wandb.util.generate_id()
         wandb.init(
             project=self.args.wandb_project_name,
             entity=self.args.wandb_entity,
-            id=progress.wandb_id,
+            id=self.progress.wandb_id,
             name=self.dir.name,
             resume="allow",
             config=asdict(self.args),
@@ -1277,7 +1255,7 @@ class Run:
         charts = {"return": ["Multiline", ["eval/return_mean", "charts/episodic_return"]]}
         for name in ("correction_norm", "settling_error", "outside_bounds"):
             charts[name] = ["Multiline", [rf"refinement/{name}_\d+"]]
-        self.writer.add_custom_scalars({"RefinePPO": charts})
+        self.writer.add_custom_scalars({"charts": charts})
 
     def compile(self, training: Training):
         """`update`, compiled if that is wanted and possible, and if the run was begun so."""
@@ -1290,78 +1268,76 @@ class Run:
         gc.freeze()  # the garbage collector need not look through all of torch again and again
         return compiled or update
 
-    def log(self, training: Training, scalars: dict[str, float], episodes: list[tuple[int, float, int]]):
+    def log(self, scalars: dict[str, float], episodes: list[tuple[int, float, int]]):
         """An iteration's numbers, and its episodes' (step, return, length)."""
-        progress = training.progress
-        for step, episode_return, length in episodes:
-            self.writer.add_scalar("charts/episodic_return", episode_return, step)
-            self.writer.add_scalar("charts/episodic_length", length, step)
+        step = self.progress.global_step
+        for episode_step, episode_return, length in episodes:
+            self.writer.add_scalar("charts/episodic_return", episode_return, episode_step)
+            self.writer.add_scalar("charts/episodic_length", length, episode_step)
             self.last_return = f"{episode_return:.1f}"
-            if step > 0.9 * self.args.total_timesteps:
-                progress.late_returns.append(episode_return)
-        for name, value in scalars.items():
-            self.writer.add_scalar(name, value, progress.global_step)
-        self.writer.add_scalar("charts/mujoco_warnings", len(mujoco_warnings), progress.global_step)
+            if episode_step > 0.9 * self.args.total_timesteps:
+                self.progress.late_returns.append(episode_return)
+        for name, value in (scalars | {"charts/mujoco_warnings": len(mujoco_warnings)}).items():
+            self.writer.add_scalar(name, value, step)
         mujoco_warnings.clear()
         self.bar.set_postfix_str(f"return {self.last_return}, evaluation {self.last_evaluation}", refresh=False)
         self.bar.update(self.args.batch_size)
 
-    def evaluate_if_due(self, training: Training):
+    def evaluate_if_due(self, agent: Agent):
         """At the first rollout's end at or after each multiple of --eval-interval, and at the end of training.
 
         One that a signal ends leaves no trace, and is made when the run is continued.
         """
-        args, progress, step = self.args, training.progress, training.progress.global_step
+        args, progress, step = self.args, self.progress, self.progress.global_step
         due = passed(args.eval_interval, max(step - args.batch_size, 0), step) or step == args.last_step
         if not due or (progress.evaluations and progress.evaluations[-1][0] == step):
             return
-        returns, lengths = evaluate(training.agent, evaluation_seeds(args, step))
+        returns, lengths = evaluate(agent, evaluation_seeds(args, step))
         if stop_signals:
             return
         mean, std = mean_and_std(returns)
         progress.evaluations.append((step, mean, std, *map(float, (returns.min(), returns.max(), lengths.mean()))))
-        self.write_evaluations(progress)
+        self.write_evaluations()
         for name, value in (("return_mean", mean), ("return_std", std), ("episode_length", lengths.mean())):
             self.writer.add_scalar(f"eval/{name}", value, step)
         if mean > progress.best_return:
             progress.best_return = mean
-            self.save("best.pt", training, selection_return=mean)
+            self.save("best.pt", agent, selection_return=mean)
         self.last_evaluation = f"{mean:.1f}"
         if args.progress:
             rate = f"best {progress.best_return:.1f}, {step / progress.train_seconds:.0f} steps/s"
             say(f"step {step:,}: evaluation return {mean:.1f} +- {std:.1f}, {rate}")
 
-    def write_evaluations(self, progress: Progress):
-        rows = [("global_step", "return_mean", "return_std", "return_min", "return_max", "length_mean")]
-        rows += progress.evaluations
-        write_atomically(self.dir / "evaluations.csv", "".join(",".join(map(str, row)) + "\n" for row in rows).encode())
+    def write_evaluations(self):
+        rows = ["global_step,return_mean,return_std,return_min,return_max,length_mean"]
+        rows += [",".join(map(str, row)) for row in self.progress.evaluations]
+        write_atomically(self.dir / "evaluations.csv", "".join(f"{row}\n" for row in rows).encode())
 
-    def save(self, name: str, training: Training, **more):
+    def save(self, name: str, agent: Agent, **more):
         """A checkpoint that acts: the agent, the flags and the step; `more` goes with it."""
-        policy = {"args": asdict(self.args), "global_step": training.progress.global_step, **training.agent.state()}
+        policy = {"args": asdict(self.args), "global_step": self.progress.global_step, **agent.state()}
         save_checkpoint(self.dir / name, policy | more)
 
     def save_last(self, training: Training):
         """The checkpoint that continues the run."""
         self.writer.flush()
         now = time.time()
-        training.progress.wall_seconds += now - self.clock
+        self.progress.wall_seconds += now - self.clock
         self.clock = now
-        self.save("last.pt", training, **training.state(), compiled=self.compiled, machine=self.machine)
+        self.save("last.pt", training.agent, **training.state(), compiled=self.compiled, machine=self.machine)
 
     def exit_if_stopped(self):
         """Exit if a signal has asked for it, and say how to go on."""
         if stop_signals:
-            missing = ([] if self.args.run_dir else ["--run-dir", str(self.dir)]) + (
-                [] if self.args.resume else ["--resume"]
-            )
-            say(f"\nstopped by {signal.Signals(stop_signals[0]).name}; continue with")
-            say(f"    {shlex.join([sys.executable, *sys.argv, *missing])}")
+            missing = [] if self.args.run_dir else ["--run-dir", str(self.dir)]
+            missing += [] if self.args.resume else ["--resume"]
+            command = shlex.join([sys.executable, *sys.argv, *missing])
+            say(f"\nstopped by {signal.Signals(stop_signals[0]).name}; continue with\n    {command}")
             raise SystemExit(EXIT_STOPPED)
 
-    def finish(self, training: Training):
+    def finish(self, agent: Agent):
         """The final evaluation of the best and the last policy; then result.json, the sign that the run is complete."""
-        args, agent, progress, final = self.args, training.agent, training.progress, {}
+        args, progress, final = self.args, self.progress, {}
         for name in ("best", "last"):
             saved = load_checkpoint(self.dir / f"{name}.pt")
             agent.load(saved)
@@ -1387,7 +1363,7 @@ class Run:
         say(f"the run is in {self.dir}; look at it with: tensorboard --logdir {shlex.quote(str(self.dir))}")
 
 
-# --- Signals ----------------------------------------------------------------------------------------------------------
+# Signals
 
 stop_signals: list[int] = []
 
@@ -1395,8 +1371,9 @@ stop_signals: list[int] = []
 def catch_signals():
     """SIGTERM, Ctrl-C, a closed terminal and Slurm's SIGUSR1 ask a run to save and stop; not under nohup."""
     for name in ("SIGTERM", "SIGINT", "SIGUSR1", "SIGHUP"):
-        if hasattr(signal, name) and (name != "SIGHUP" or signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN):
-            signal.signal(getattr(signal, name), request_stop)
+        signum = getattr(signal, name, None)  # Windows lacks the last two
+        if signum and (name != "SIGHUP" or signal.getsignal(signum) is not signal.SIG_IGN):
+            signal.signal(signum, request_stop)
 
 
 def request_stop(signum, _):
@@ -1415,3 +1392,6 @@ if __name__ == "__main__":
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             raise
         sys.exit(f"{SCRIPT}: error: {error.strerror}; every checkpoint saved before is intact")
+    finally:
+        for task in list(open_tasks):
+            task.close()
