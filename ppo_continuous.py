@@ -3,7 +3,6 @@
     a ~ Normal(m(s), exp(log_std)),   m a tanh network of the normalised observation, in one pass
 
 `refineppo_continuous.py` is this file with another actor; read the two side by side, their diff is the paper.
-Evaluation acts with m(s) clipped to the action bounds.
 
     python ppo_continuous.py --env-id HalfCheetah-v5
     python ppo_continuous.py --evaluate runs/.../best.pt --render
@@ -218,16 +217,16 @@ class Agent:
         self.params = {name: p.to(self.device) for name, p in init_params(sizes, args).items()}
         self.normalizer = Normalizer(args.num_envs, obs_dim, args)
 
+    def mean(self, obs: np.ndarray) -> np.ndarray:
+        """m(s), (action_dim,) or (n, action_dim), of raw observations (obs_dim,) or (n, obs_dim)."""
+        weights, normalize = layers(self.arrays(), "actor"), self.normalizer.normalize
+        return in_rows_of_8(lambda rows: network(weights, normalize(rows)), obs)
+
     def act(self, obs: np.ndarray) -> np.ndarray:
         """The deterministic action of raw observations, (obs_dim,) or (n, obs_dim): the policy's mean (Algorithm 1,
         line 10), clipped to the action bounds, as training clips its actions and CleanRL does.
         """
         return np.clip(self.mean(obs), self.low, self.high)
-
-    def mean(self, obs: np.ndarray) -> np.ndarray:
-        """m(s), (action_dim,) or (n, action_dim), of raw observations (obs_dim,) or (n, obs_dim)."""
-        weights, normalize = layers(self.arrays(), "actor"), self.normalizer.normalize
-        return in_rows_of_8(lambda rows: network(weights, normalize(rows)), obs)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The parameters to act with: on the CPU views that follow every update, on a GPU copies."""
@@ -1085,6 +1084,8 @@ class Run:
         self.last_return = self.last_evaluation = "-"  # shown by the progress bar
         self.stack = ExitStack()  # what is to be closed, however the run ends
         self.progress = Progress()
+        if not str(self.dir).isprintable():
+            refuse(f"this locale cannot spell the folder {ascii(str(self.dir))}; PYTHONUTF8=1 helps")
         try:
             self.dir.mkdir(parents=True, exist_ok=True)
             self.lock()

@@ -2,9 +2,8 @@
 
     m_0 = 0,   m_{k+1} = m_k + c_{k+1} f(s, m_k),   k = 0..K-1,   a ~ Normal(m_K, exp(log_std))
 
-One network f serves every step, and gradients flow through the whole chain. Evaluation acts with m_K clipped to the
-action bounds. The rest is plain PPO: this file differs from `ppo_continuous.py` in the flags of the refinement, the
-actor and the `refinement/*` logs, and in nothing else.
+One network f serves every step; gradients flow through the whole chain; evaluation acts with m_K, clipped to the action
+bounds. All else is `ppo_continuous.py`, line by line: only the flags, the actor and its `refinement/*` logs differ.
 
     python refineppo_continuous.py --env-id HalfCheetah-v5 --refinement-depth 4 --refinement-schedule average
     python refineppo_continuous.py --evaluate runs/.../best.pt --render
@@ -164,11 +163,6 @@ class Args:
         """Environment steps of the whole run; as in CleanRL, a last incomplete rollout is left out."""
         return self.total_timesteps // self.batch_size * self.batch_size
 
-    @property
-    def coefficients(self) -> list[float]:
-        """The step sizes c_1, ..., c_K."""
-        return refinement_coefficients(self.refinement_schedule, self.refinement_depth)
-
 
 # --- Policy -----------------------------------------------------------------------------------------------------------
 
@@ -185,19 +179,17 @@ def network(weights: list[tuple], x):
     return dot(w_out.T, x.T).T + b_out  # x w_out: BLAS is faster with the narrow side first
 
 
-def refinement_coefficients(schedule: str, depth: int) -> list[float]:
+def refinement_coefficients(args: Args) -> list[float]:
     """c_1, ..., c_K of the paper's three schedules; for K = 1 all are [1]."""
+    depth = args.refinement_depth
     schedules = {"average": lambda k: 1 / depth, "uniform": lambda k: 1.0, "inverse": lambda k: 1 / k}
-    return [schedules[schedule](k) for k in range(1, depth + 1)]
+    return [schedules[args.refinement_schedule](k) for k in range(1, depth + 1)]
 
 
 def proposals(weights: list[tuple], coefficients: list[float], obs) -> list:
-    """The refinement (Algorithm 1, lines 1 to 4): m_1, ..., m_K, each (batch, action_dim), from m_0 = 0.
+    """m_{k+1} = m_k + c_{k+1} f(s, m_k) from m_0 = 0: m_1, ..., m_K, each (batch, action_dim) (Algorithm 1, lines 1-4).
 
-        m_{k+1} = m_k + c_{k+1} f(s, m_k)
-
-    f is a tanh network over concat(s, m); `weights` are its layers' (weight, bias). Arrays or tensors; the normalised
-    observations obs, s above, are (batch, obs_dim).
+    f is a tanh network over concat(s, m), `weights` its layers' (weight, bias), s the normalised obs (batch, obs_dim).
     """
     dot, tanh = ARRAY_OPS if isinstance(obs, np.ndarray) else TENSOR_OPS
     (w, b), *hidden, (w_out, b_out) = weights
@@ -259,16 +251,17 @@ class Agent:
         self.params = {name: p.to(self.device) for name, p in init_params(sizes, args).items()}
         self.normalizer = Normalizer(args.num_envs, obs_dim, args)
 
+    def proposals(self, obs: np.ndarray) -> np.ndarray:
+        """m_1, ..., m_K, (K, action_dim) or (K, n, action_dim), of raw observations (obs_dim,) or (n, obs_dim)."""
+        weights, normalize = layers(self.arrays(), "actor"), self.normalizer.normalize
+        coefficients = refinement_coefficients(self.args)
+        return in_rows_of_8(lambda rows: np.stack(proposals(weights, coefficients, normalize(rows))), obs)
+
     def act(self, obs: np.ndarray) -> np.ndarray:
         """The deterministic action of raw observations, (obs_dim,) or (n, obs_dim): the policy's mean (Algorithm 1,
         line 10), clipped to the action bounds, as training clips its actions and CleanRL does.
         """
         return np.clip(self.proposals(obs)[-1], self.low, self.high)
-
-    def proposals(self, obs: np.ndarray) -> np.ndarray:
-        """m_1, ..., m_K, (K, action_dim) or (K, n, action_dim), of raw observations (obs_dim,) or (n, obs_dim)."""
-        weights, normalize = layers(self.arrays(), "actor"), self.normalizer.normalize
-        return in_rows_of_8(lambda rows: np.stack(proposals(weights, self.args.coefficients, normalize(rows))), obs)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The parameters to act with: on the CPU views that follow every update, on a GPU copies."""
@@ -477,7 +470,7 @@ def collect(agent: Agent, envs: Environments, num_steps: int, rng: np.random.Gen
 
     The actor runs in NumPy: for one observation torch's overhead per call is larger than the arithmetic.
     """
-    arrays, coefficients = agent.arrays(), agent.args.coefficients
+    arrays, coefficients = agent.arrays(), refinement_coefficients(agent.args)
     weights, log_std, obs = layers(arrays, "actor"), arrays["log_std"], agent.normalizer.normalize(envs.obs)
     noise = rng.standard_normal((num_steps, len(obs), len(log_std)), dtype=np.float32)
     perturbation = noise * np.exp(log_std)
@@ -537,7 +530,7 @@ LOSSES = ("policy_loss", "value_loss", "entropy", "old_approx_kl", "approx_kl", 
 def ppo_loss(params: dict, args: Args, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
     """PPO's loss on a minibatch, and the first six of LOSSES."""
     log_std = params["log_std"]
-    mean = proposals(layers(params, "actor"), args.coefficients, batch.obs)[-1]
+    mean = proposals(layers(params, "actor"), refinement_coefficients(args), batch.obs)[-1]
     z = (batch.actions - mean) * torch.exp(-log_std)
     logratio = -(0.5 * z**2 + log_std + 0.5 * math.log(2 * math.pi)).sum(-1) - batch.logprobs
     ratio = logratio.exp()
@@ -708,7 +701,7 @@ def refinement_scalars(agent: Agent, obs: torch.Tensor) -> dict[str, float]:
     correction_norm_k: mean norm of c_k f; settling_error_k: e_k of the paper, averaged over the action components;
     outside_bounds_k: fraction of the proposals m_k with a component outside the action bounds.
     """
-    all_m = proposals(layers(agent.params, "actor"), agent.args.coefficients, obs[::8])
+    all_m = proposals(layers(agent.params, "actor"), refinement_coefficients(agent.args), obs[::8])
     low, high = (torch.from_numpy(bound).to(agent.device) for bound in (agent.low, agent.high))
     scalars, last, before = {}, all_m[-1], 0
     for k, m in enumerate(all_m, start=1):
@@ -1145,6 +1138,8 @@ class Run:
         self.last_return = self.last_evaluation = "-"  # shown by the progress bar
         self.stack = ExitStack()  # what is to be closed, however the run ends
         self.progress = Progress()
+        if not str(self.dir).isprintable():
+            refuse(f"this locale cannot spell the folder {ascii(str(self.dir))}; PYTHONUTF8=1 helps")
         try:
             self.dir.mkdir(parents=True, exist_ok=True)
             self.lock()
