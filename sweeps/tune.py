@@ -16,7 +16,7 @@ So a search of two trials only asks which of the two is better:
 
 RefinePPO's depth and schedule are searched within the same number of trials, or fixed by two flags. Trials that fail
 (no episode ended, numbers not finite, two crashes) count too. Leaves in --out-dir the runs as
-<study>/trial_<number>/seed_<seed>, every trial in <study>/trials.csv, and the winner as settings/<algorithm>/<task>.args
+<study>/trial_<n>/seed_<seed>, every trial in <study>/trials.csv, and the winner as settings/<algorithm>/<task>.args
 (settings-K4-average/... for a fixed depth, settings-<name>/... for a study with a name), for the job generators:
 
     SETTINGS=runs/tune/settings sweeps/benchmark.sh Hopper-v5 | sweeps/run_local.sh -j 8
