@@ -246,7 +246,7 @@ def shown(value, scale: float | None = None) -> str:
     if type(value) is not float:
         return f"{value:,}" if type(value) is int else str(value)
     size = abs(value if scale is None else scale)
-    return f"{value:.{0 if size >= 100 else 1 if size >= 10 else 2}f}"
+    return f"{value:z.{0 if size >= 100 else 1 if size >= 10 else 2}f}"
 
 
 def csv_cells(row: dict) -> dict:
@@ -280,19 +280,18 @@ class Report:
         """Rows of header -> cell as Markdown, LaTeX and CSV; nothing without rows."""
         if rows:
             frame = pd.DataFrame(rows, dtype=object).map(shown)
-            sides = ["left"] + ["right"] * (frame.shape[1] - 1)
+            sides = "left", *["right"] * (frame.shape[1] - 1)
             text = frame.to_markdown(index=False, disable_numparse=True, colalign=sides)
             numbers = pd.DataFrame([*map(csv_cells, rows)], dtype=object).to_csv(index=False, lineterminator="\n")
             links = self.add(f"{name}.csv", numbers.encode()), self.add(f"{name}.tex", latex(frame).encode())
             self.blocks[name] = f"{text}\n\n{', '.join(links)}"
 
     def figure(self, name: str, figure: Figure):
-        links = {}
-        for kind, options in (("png", {}), ("pdf", {"metadata": {"CreationDate": None}})):
-            file = io.BytesIO()
-            figure.savefig(file, format=kind, **options)
-            links[kind] = self.add(f"{name}.{kind}", file.getvalue())
-        self.blocks[f"{name}_figure"] = f"!{links['png']}\n\n{links['pdf']}"
+        png, pdf = io.BytesIO(), io.BytesIO()
+        figure.savefig(png, format="png")
+        figure.savefig(pdf, format="pdf", metadata={"CreationDate": None})
+        links = self.add(f"{name}.png", png.getvalue()), self.add(f"{name}.pdf", pdf.getvalue())
+        self.blocks[f"{name}_figure"] = "!{}\n\n{}".format(*links)
 
 
 def new_figure(rows: int, columns: int, width: float, height: float, **options) -> tuple[Figure, np.ndarray]:
@@ -351,7 +350,7 @@ def training_curves(e: Experiment, report: Report):
 
 
 def curves_figure(curves: dict[str, list[list[np.ndarray]]]) -> Figure:
-    columns, lines, handles = min(3, len(curves)), -(-len(curves) // 3), {}
+    columns, lines, handles = min(3, len(curves)), math.ceil(len(curves) / 3), {}
     figure, axes = new_figure(lines, columns, max(2.3 * columns, 3.2), 1.7 * lines + 0.4)
     for axis in axes.flat[len(curves) :]:
         axis.remove()
@@ -660,9 +659,11 @@ def missing(e: Experiment) -> list[str]:
     expected = {"PPO": [Cell(cell.task) for cell in refined], "RefinePPO": refined}
     expected |= {f"the {name} schedule": [cell._replace(schedule=name) for cell in refined] for name in SCHEDULES}
     expected |= {f"K = {depth}": [cell._replace(depth=depth) for cell in refined] for depth in DEPTHS}
-    none = {item: [cell.task for cell in cells if cell not in e.cells] for item, cells in expected.items()}
-    lines = [f"no finished run of {item}: {', '.join(x)}" for item, x in none.items() if 0 < len(x) < len(refined)]
-    few = defaultdict(list)
+    lacking, few = defaultdict(list), defaultdict(list)
+    for item, cells in expected.items():
+        lacking[", ".join(cell.task for cell in cells if cell not in e.cells)].append(item)
+    some = {tasks: items for tasks, items in lacking.items() if tasks and tasks != ", ".join(e.paper_tasks)}
+    lines = [f"no finished run of {', '.join(items)}: {tasks}" for tasks, items in some.items()]
     for cell, runs in e.cells.items():
         few[len(runs), cell.method].append(cell.task)
     return lines + [f"{n} of {SEEDS} seeds of {m}: {', '.join(few[n, m])}" for n, m in sorted(few) if n < SEEDS]
@@ -673,18 +674,15 @@ def missing(e: Experiment) -> list[str]:
 
 def make_report(runs: pd.DataFrame, evaluations: pd.DataFrame, args: Args) -> dict[str, bytes]:
     """The files of a report, report.md first."""
-    experiments = []
+    experiments, finished = [], runs[runs.failure == ""]
+    sections = settings, baseline, training_curves, sample_efficiency, table_2, depth_figure, few_seeds, controls
     with rc_context(STYLE):
-        for steps in sorted({*runs.steps}, key=lambda steps: (-(runs.steps == steps).sum(), steps)):
-            finished = runs[(runs.steps == steps) & (runs.failure == "")]
-            if len(finished):
-                e, report = Experiment(finished, evaluations, args), Report(short(steps))
-                settings(e, report)
-                action_dimension(report, table_1(e, report))
-                sections = baseline, training_curves, sample_efficiency, table_2, depth_figure, few_seeds, controls
-                for section in (*sections, learning_rates, variants, toy, cost):
-                    section(e, report)
-                experiments.append((e, report, missing(e)))
+        for steps in sorted({*finished.steps}, key=lambda steps: (-(finished.steps == steps).sum(), steps)):
+            e, report = Experiment(finished[finished.steps == steps], evaluations, args), Report(short(steps))
+            action_dimension(report, table_1(e, report))
+            for section in (*sections, learning_rates, variants, toy, cost):
+                section(e, report)
+            experiments.append((e, report, missing(e)))
     changed = [name for name in ("depth", "schedule", "curve_tasks") if getattr(args, name) != getattr(Args, name)]
     flags = shlex.join(words({name: getattr(args, name) for name in changed}))
     failed = [*runs[runs.failure != ""].itertuples()]
@@ -732,7 +730,8 @@ def main():
     found = merge(run for source in args.sources for run in read_source(source, said.append))
     if not found:
         refuse("; ".join([f"there is no finished run in {', '.join(map(str, args.sources))}", *said]))
-    folder = args.out_dir or (first if (first / "runs.csv").is_file() else first / "report")
+    table = first if first.is_file() else first / "runs.csv"
+    folder = args.out_dir or (table.parent if table.is_file() else first / "report")
     check_folder(folder, found)
     print(*said, sep="\n", end="\n" if said else "")
     runs, evaluations = as_tables(found)
@@ -742,9 +741,8 @@ def main():
         (folder / name).unlink(missing_ok=True)
     for name, content in files.items():  # report.md first, since it marks the folder as a report's
         (folder / name).parent.mkdir(exist_ok=True)
-        new = folder / f"{name}.tmp"
-        new.write_bytes(content)
-        new.replace(folder / name)
+        (folder / f"{name}.tmp").write_bytes(content)
+        (folder / f"{name}.tmp").replace(folder / name)
     print(f"{len(found)} runs; the report is in {folder / 'report.md'}")
 
 

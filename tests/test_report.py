@@ -169,7 +169,7 @@ def test_table_2(tmp_path, make_report):
     assert rows["task"] == "average|uniform|inverse|paper: average|paper: uniform|paper: inverse|seeds".split("|")
     assert rows["Reacher-v5"] == "4.00 ± 1.41|1.50 ± 0.71|2.00|-3.0|-3.5|-3.3|2 / 2 / 1".split("|")
     assert "Swimmer-v5" not in rows
-    assert "no finished run of the inverse schedule: Ant-v5, HalfCheetah-v5," in section(text, "What is missing")
+    assert "the uniform schedule, the inverse schedule: Ant-v5, HalfCheetah-v5," in section(text, "What is missing")
 
 
 def test_depth(tmp_path, make_report):
@@ -192,7 +192,10 @@ def test_depth(tmp_path, make_report):
         assert float(row["fixed_bounds_std"]) == pytest.approx(stdev(scores))
     assert rows["Reacher-v5"][:4] == ["-10.0 ± 1.4", "-5.00 ± 1.41", "-5.00 ± 1.41", "-6.00 ± 1.41"]
     assert "Left out, without finished runs of all these K: Swimmer-v5." in text
-    assert "no finished run of K = 8: Ant-v5" in text and "2 of 5 seeds of RefinePPO K=8 average: Hopper-v5" in text
+    assert (
+        "K = 8: Ant-v5, HalfCheetah-v5, Walker2d-v5" in text
+        and "2 of 5 seeds of RefinePPO K=8 average: Hopper-v5" in text
+    )
 
 
 def test_depths_that_are_not_there(tmp_path, make_report):
