@@ -3,6 +3,7 @@
     a ~ Normal(m(s), exp(log_std)),   m a tanh network of the normalised observation, in one pass
 
 `refineppo_continuous.py` is this file with another actor; read the two side by side, their diff is the paper.
+Evaluation acts with m(s) clipped to the action bounds.
 
     python ppo_continuous.py --env-id HalfCheetah-v5
     python ppo_continuous.py --evaluate runs/.../best.pt --render
@@ -14,41 +15,44 @@ minibatch update (loss, gradient, clipping, Adam) is one compiled function.
 """
 
 import errno
-import fcntl
 import gc
 import io
 import json
 import math
 import os
 import platform
+import random
 import shlex
 import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
+import traceback
 import warnings
 import zipfile
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
-from importlib import import_module
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass, field, fields, replace
 from importlib.metadata import version
 from importlib.util import find_spec
-from itertools import accumulate
 from pathlib import Path
+from typing import NamedTuple
 
+import filelock
 import gymnasium as gym
 import mujoco
 import numpy as np
 import torch
 import tyro
+from gymnasium.utils.env_checker import check_env
 from threadpoolctl import threadpool_limits
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 from tqdm import tqdm
 
 
-@dataclass
+@dataclass(frozen=True)
 class Args:
     env_id: str = "HalfCheetah-v5"
     """Gymnasium id of the task; `module:Env-v0` imports the module first"""
@@ -62,6 +66,8 @@ class Args:
     """folder of the run; default runs/{env_id}__{exp_name}__{seed}__{unix time}"""
     resume: bool = False
     """continue the run in --run-dir where its last checkpoint left it; a finished run is left as it is"""
+    max_episode_steps: int | None = None
+    """time limit of an episode, in steps; default the task's own"""
 
     # PPO, with CleanRL's names and defaults
     learning_rate: float = 3e-4
@@ -111,7 +117,7 @@ class Args:
     eval_interval: int = 100_000
     """environment steps between evaluations of the deterministic policy"""
     eval_episodes: int = 10
-    """episodes of each evaluation during training"""
+    """episodes of each evaluation during training, each in an environment of its own"""
     final_eval_episodes: int = 10
     """episodes of the final evaluations, and of --evaluate"""
     checkpoint_interval: int = 50_000
@@ -132,8 +138,6 @@ class Args:
     """update on the GPU; acting stays on the CPU"""
     num_threads: int = 1
     """threads of torch; sweeps fill cores with processes instead"""
-    torch_deterministic: bool = True
-    """allow only deterministic algorithms on the GPU; on the CPU there are no others here"""
     progress: bool = True
     """show a progress bar (on a terminal) and a line per evaluation"""
     track: bool = False
@@ -149,96 +153,105 @@ class Args:
         return self.num_envs * self.num_steps
 
     @property
-    def num_iterations(self) -> int:
-        """Rollouts in the whole run; as in CleanRL, a last incomplete one is left out."""
-        return self.total_timesteps // self.batch_size
+    def last_step(self) -> int:
+        """Environment steps of the whole run; as in CleanRL, a last incomplete rollout is left out."""
+        return self.total_timesteps // self.batch_size * self.batch_size
 
 
-SCRIPT = Path(__file__).name
-EXIT_BAD_ARGUMENTS, EXIT_FAILURE, EXIT_STOPPED = 2, 3, 75
-FREE_ON_RESUME = {"resume", "run_dir", "progress", "track", "capture_video", "checkpoint_interval"}
+# --- Policy -----------------------------------------------------------------------------------------------------------
+
+ARRAY_OPS = np.ndarray.dot, np.tanh  # dot: on small arrays half the time of @
+TENSOR_OPS = torch.mm, torch.tanh
 
 
-def refuse(sentence: str):
-    """End the program with one sentence about its input."""
-    print(f"{Path(sys.argv[0]).name}: error: {sentence}", file=sys.stderr)
-    raise SystemExit(EXIT_BAD_ARGUMENTS)
+def policy_mean(weights: list[tuple], obs):
+    """m(s), (batch, action_dim): a tanh network in one pass; `weights` are its layers' (weight, bias).
+
+    Arrays or tensors; the normalised observations obs, s above, are (batch, obs_dim).
+    """
+    dot, tanh = ARRAY_OPS if isinstance(obs, np.ndarray) else TENSOR_OPS
+    *hidden, (w_out, b_out) = weights
+    x = obs
+    for w, b in hidden:
+        x = tanh(dot(x, w) + b)
+    return dot(w_out.T, x.T).T + b_out  # x w_out: BLAS is faster with the narrow side first
 
 
-def first_line(error: Exception) -> str:
-    return next(iter(str(error).strip().splitlines()), type(error).__name__)
+def critic_value(weights: list[tuple], obs: torch.Tensor) -> torch.Tensor:
+    """V(s), (batch,), of normalised observations (batch, obs_dim)."""
+    *hidden, (w_out, b_out) = weights
+    for w, b in hidden:
+        obs = torch.tanh(obs @ w + b)
+    return (w_out.T @ obs.T).squeeze(0) + b_out
 
 
-def check_args(args: Args) -> tuple[gym.spaces.Box, gym.spaces.Box]:
-    """Refuse what cannot be trained before any work starts; return the task's observation and action space."""
-    counts = "total_timesteps num_envs num_steps num_minibatches update_epochs eval_interval eval_episodes num_threads"
-    counts += " final_eval_episodes checkpoint_interval save_every actor_hidden critic_hidden"
-    rules = (
-        ("at least 1", counts, lambda x: x >= 1),
-        ("positive", "learning_rate clip_coef max_grad_norm target_kl", lambda x: 0 < x < math.inf),
-        ("between 0 and 1", "gamma gae_lambda", lambda x: 0 <= x <= 1),
-        ("a finite number", "ent_coef vf_coef log_std_init", math.isfinite),
-        ("from 0 to 2^63 - 1", "seed", lambda x: 0 <= x < 2**63),
-    )
-    for rule, names, holds in rules:
-        for name in names.split():
-            value = getattr(args, name)
-            if value is not None and not all(map(holds, (value or (0,)) if isinstance(value, tuple) else (value,))):
-                refuse(f"--{name.replace('_', '-')} must be {rule}, not {value}")
-    if args.batch_size % args.num_minibatches:
-        steps = f"{args.batch_size} steps ({args.num_envs} environments x {args.num_steps} steps)"
-        refuse(f"{args.num_minibatches} minibatches do not divide a rollout of {steps} evenly")
-    if args.batch_size == args.num_minibatches:
-        refuse("a minibatch must have at least 2 steps, to normalise its advantages; use fewer --num-minibatches")
-    if args.num_iterations < 1:
-        refuse(f"--total-timesteps {args.total_timesteps} is less than one rollout of {args.batch_size} steps")
-    if args.resume and not args.run_dir:
-        refuse("--resume needs --run-dir, the folder of the run to continue")
-    if args.render and not args.evaluate:
-        refuse("--render shows the episodes of --evaluate; training is not shown")
-    for extra, wanted, module in (("track", args.track, "wandb"), ("video", args.capture_video, "moviepy")):
-        if wanted and find_spec(module) is None:
-            refuse(f"the package {module} is missing: pip install -e '.[{extra}]'")
-    if args.cuda and not torch.cuda.is_available():
-        refuse("--cuda was asked for, but torch finds no CUDA device")
-    try:
-        with warnings.catch_warnings(action="ignore"):  # shown again when training makes its environments
-            task = make_env(args.env_id)
-    except Exception as error:  # unknown id, missing module or package: whatever gymnasium or the module raises
-        refuse(f"cannot make the task {args.env_id}: {first_line(error)}")
-    task.close()
-    if task.spec.max_episode_steps is None and not args.evaluate:
-        print(f"warning: {args.env_id} has no time limit; --resume replays the running episode, however long")
-    for what, space in (("observations", task.observation_space), ("actions", task.action_space)):
-        if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1 or space.shape[0] < 1:
-            refuse(f"{args.env_id} has {what} in {space}; only a one-dimensional Box is supported")
-    return task.observation_space, task.action_space
+def init_params(sizes: dict[str, list[int]], args: Args) -> dict[str, torch.Tensor]:
+    """Orthogonal weights, (in, out), of gain sqrt 2 (outputs: actor 0.01, critic 1), zero biases, and log_std."""
+    generator = torch.Generator().manual_seed(args.seed)
+    params = {}
+    for name, output_gain in (("actor", 0.01), ("critic", 1.0)):
+        *hidden, output = zip(sizes[name], sizes[name][1:])
+        for i, (shape, gain) in enumerate([*((shape, math.sqrt(2)) for shape in hidden), (output, output_gain)]):
+            params[f"{name}.{i}.weight"] = torch.nn.init.orthogonal_(torch.empty(shape), gain, generator)
+            params[f"{name}.{i}.bias"] = torch.zeros(shape[1])
+    params["log_std"] = torch.full((sizes["actor"][-1],), args.log_std_init)
+    return params
 
 
-def limit_threads(args: Args):
-    """torch's threads and NumPy's, the number of which decides the last bits of their results."""
-    torch.set_num_threads(args.num_threads)
-    threadpool_limits(args.num_threads)
+def layers(params: dict, name: str) -> list[tuple]:
+    """The (weight, bias) pairs of the network `name`, first to last."""
+    tensors = [p for key, p in params.items() if key.startswith(name)]
+    return list(zip(tensors[::2], tensors[1::2]))
 
 
-# --- Environment ------------------------------------------------------------------------------------------------------
+def in_rows_of_8(function, obs: np.ndarray) -> np.ndarray:
+    """`function` of rows (8, obs_dim), for one observation (obs_dim,) or for any number of them (n, obs_dim).
 
-mujoco_warnings: list[str] = []  # where MuJoCo reports an unstable simulation, which it otherwise hides
-mujoco.set_mju_user_warning(mujoco_warnings.append)
-
-
-def make_env(env_id: str, render_mode: str | None = None) -> gym.Env:
-    """One environment of the task; what MuJoCo says of the model file while it loads is dropped."""
-    seen = len(mujoco_warnings)
-    rendering = {"render_mode": render_mode} if render_mode else {}  # a task need not know the keyword
-    env = gym.make(env_id, disable_env_checker=True, **rendering)
-    del mujoco_warnings[seen:]
-    return env
+    How a product of matrices rounds depends on its number of rows. With always eight, an action, and so an episode's
+    return, does not depend on how many others are computed beside it.
+    """
+    rows = np.atleast_2d(obs)
+    blocks = np.resize(rows, (-(-len(rows) // 8), 8, rows.shape[1]))  # the last one is filled up with copies
+    out = np.concatenate([function(block) for block in blocks], axis=-2)
+    return out[..., : len(rows), :] if np.ndim(obs) == 2 else out[..., 0, :]
 
 
-def episode_seeds(seed: int, *key: int, count: int = 1) -> list[int]:
-    """Seeds for `env.reset`, a stream of its own for every key: (0, env, episode) trains, (1, step) evaluates."""
-    return np.random.SeedSequence(seed, spawn_key=key).generate_state(count).tolist()
+class Agent:
+    """The policy, the value function and the normalizer: all that is needed to act. See `load_agent`."""
+
+    def __init__(self, obs_space: gym.spaces.Box, action_space: gym.spaces.Box, args: Args):
+        self.args, self.device = args, torch.device("cuda" if args.cuda else "cpu")
+        self.low, self.high = action_space.low, action_space.high
+        (obs_dim,), (action_dim,) = obs_space.shape, action_space.shape
+        sizes = {
+            "actor": [obs_dim, *args.actor_hidden, action_dim],
+            "critic": [obs_dim, *args.critic_hidden, 1],
+        }
+        self.params = {name: p.to(self.device) for name, p in init_params(sizes, args).items()}
+        self.normalizer = Normalizer(args.num_envs, obs_dim, args)
+
+    def act(self, obs: np.ndarray) -> np.ndarray:
+        """The deterministic action m(s), clipped to the action bounds, of raw observations (obs_dim,) or (n, obs_dim).
+
+        Training clips its actions too, as CleanRL does.
+        """
+        weights, normalize = layers(self.arrays(), "actor"), self.normalizer.normalize
+        means = in_rows_of_8(lambda rows: policy_mean(weights, normalize(rows)), obs)
+        return np.clip(means, self.low, self.high)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The parameters to act with: on the CPU views that follow every update, on a GPU copies."""
+        return {name: p.cpu().numpy() for name, p in self.params.items()}
+
+    def state(self) -> dict:
+        return {"params": self.params, "normalizer": self.normalizer.state()}
+
+    def load(self, state: dict):
+        copy_into(self.params, state["params"])
+        self.normalizer.load(state["normalizer"])
+
+
+# --- Environments and normalizer --------------------------------------------------------------------------------------
 
 
 class Environments:
@@ -248,28 +261,30 @@ class Environments:
     HalfCheetah takes 60. Every episode has a seed of its own, so that its seed and its actions replay it exactly.
     """
 
-    def __init__(self, env_id: str, num_envs: int, seed: int):
-        self.env_id, self.seed = env_id, seed
-        self.envs = [None] * num_envs
-        self.episodes = [0] * num_envs  # episodes started
-        self.actions = [[] for _ in range(num_envs)]  # since the running episode's start
-        self.returns = [0.0] * num_envs  # of the running episode, raw: before any normalisation
-        self.obs = np.stack([self.reset(i) for i in range(num_envs)])
+    def __init__(self, args: Args):
+        self.args = args
+        self.envs: list[Task | None] = [None] * args.num_envs
+        self.episodes = [0] * args.num_envs  # episodes started
+        self.actions = [[] for _ in self.envs]  # since the running episode's start
+        self.returns = [0.0] * args.num_envs  # of the running episode, raw: before any normalisation
+        self.obs = np.stack([self.reset(i) for i in range(args.num_envs)])  # (N, obs_dim), raw
 
     def reset(self, i: int) -> np.ndarray:
         """Start environment i's next episode."""
-        if self.envs[i] is None or "BipedalWalker" in self.env_id:  # this one's Box2D world keeps state between
-            self.envs[i] = make_env(self.env_id)  # episodes: only in a new world can one be replayed exactly
-        (seed,) = episode_seeds(self.seed, 0, i, self.episodes[i])
+        if self.envs[i] is None or "BipedalWalker" in self.args.env_id:  # this one's Box2D world keeps state between
+            if self.envs[i] is not None:  # episodes: only in a new world can one be replayed exactly
+                self.envs[i].close()
+            self.envs[i] = make_env(self.args, env=i)
+        (seed,) = episode_seeds(self.args.seed, 0, i, self.episodes[i])
         self.episodes[i] += 1
         self.actions[i], self.returns[i] = [], 0.0
         return self.envs[i].reset(seed=seed)[0]
 
-    def step_one(self, i: int, action: np.ndarray) -> tuple:
+    def step_one(self, i: int, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
         """Step environment i and record what its replay and its return need."""
         obs, reward, terminated, truncated, _ = self.envs[i].step(action)
         self.actions[i].append(action)
-        self.returns[i] += float(reward)
+        self.returns[i] += reward
         return obs, reward, terminated, truncated
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, list, list, list, dict]:
@@ -282,7 +297,7 @@ class Environments:
         for i, action in enumerate(actions):
             obs, reward, terminal, timeout = self.step_one(i, action)
             if terminal or timeout:
-                ended[i] = np.array(obs), self.returns[i], len(self.actions[i])
+                ended[i] = obs, self.returns[i], len(self.actions[i])
                 obs = self.reset(i)
             self.obs[i] = obs
             rewards.append(reward)
@@ -291,22 +306,23 @@ class Environments:
         return self.obs, rewards, terminated, truncated, ended
 
     def state(self) -> dict:
-        """How many episodes each environment has started, its actions since the last one's start, and where it is."""
+        """How many episodes each environment has started, and of the running one its actions and where they led."""
         actions = [torch.tensor(np.array(a)) for a in self.actions]
-        return {"episodes": self.episodes, "actions": actions, "obs": torch.tensor(self.obs)}
+        return {"episodes": self.episodes, "actions": actions, "returns": self.returns, "obs": torch.tensor(self.obs)}
 
     def load(self, state: dict):
-        """Bring every environment exactly to where it was, by replaying its running episode."""
+        """Bring every environment exactly to where it was, by replaying its running episode; warn if that fails."""
+        same = True
         for i, actions in zip(range(len(self.envs)), state["actions"], strict=True):
             self.episodes[i] = state["episodes"][i] - 1
             self.obs[i] = self.reset(i)
             for action in actions.numpy():
-                self.obs[i], *_ = self.step_one(i, action)
-        if not np.array_equal(self.obs, state["obs"].numpy()):
-            print(f"warning: {self.env_id} does not repeat itself, so that the resumed run will differ")
-
-
-# --- Normaliser -------------------------------------------------------------------------------------------------------
+                self.obs[i], _, *ends = self.step_one(i, action)
+                if any(ends):
+                    same, self.obs[i] = False, self.reset(i)
+                    break
+        if not (same and self.returns == state["returns"] and np.array_equal(self.obs, state["obs"].numpy())):
+            say(f"warning: {self.args.env_id} does not repeat itself, so that the resumed run will differ")
 
 
 class RunningMeanStd:
@@ -340,9 +356,14 @@ class RunningMeanStd:
 
 def discounted_sums(x: np.ndarray, decay: np.ndarray, initial: np.ndarray) -> np.ndarray:
     """y_t = x_t + decay_t y_{t-1} down each column of x and decay (T, N), with y_{-1} = initial (N,)."""
-    columns = zip(x.T.tolist(), decay.T.tolist(), initial.tolist())  # floats: faster than small arrays
-    sums = [accumulate(zip(xs, ds), lambda y, xd: xd[0] + xd[1] * y, initial=y) for xs, ds, y in columns]
-    return np.array([list(column)[1:] for column in sums]).T
+    columns = []
+    for x_column, decay_column, y in zip(x.T.tolist(), decay.T.tolist(), initial.tolist()):
+        column = []
+        for x_t, decay_t in zip(x_column, decay_column):  # floats: faster than small arrays
+            y = x_t + decay_t * y
+            column.append(y)
+        columns.append(column)
+    return np.array(columns).T
 
 
 class Normalizer:
@@ -382,100 +403,14 @@ class Normalizer:
         variance = self.returns.update_each(discounted)
         return np.clip(rewards / np.sqrt(variance + 1e-8)[:, None], -10, 10)
 
-    def tensors(self) -> dict[str, torch.Tensor]:
+    def state(self) -> dict[str, torch.Tensor]:
         """Everything that changes, as tensors that share its memory."""
         arrays = {f"obs.{name}": array for name, array in vars(self.obs).items()}
         arrays |= {f"returns.{name}": array for name, array in vars(self.returns).items()}
         return {name: torch.from_numpy(array) for name, array in (arrays | {"discounted": self.discounted}).items()}
 
-
-# --- Actor and critic -------------------------------------------------------------------------------------------------
-
-ARRAY_OPS = np.ndarray.dot, np.tanh  # dot: on small arrays half the time of @
-TENSOR_OPS = torch.mm, torch.tanh
-
-
-class Actor:
-    """The policy mean m(s): a tanh network of the observation, in one pass, in tensors or in arrays.
-
-    Its weights come with every call, as `layers` gives them.
-    """
-
-    def __init__(self, obs_dim: int, action_dim: int, args: Args):
-        self.sizes = [obs_dim, *args.actor_hidden, action_dim]
-
-    def mean(self, weights: list, obs):
-        """m(s), (batch, action_dim); obs is (batch, obs_dim)."""
-        dot, tanh = ARRAY_OPS if isinstance(obs, np.ndarray) else TENSOR_OPS
-        *hidden, (w_out, b_out) = weights
-        x = obs
-        for w, b in hidden:
-            x = tanh(dot(x, w) + b)
-        return dot(w_out.T, x.T).T + b_out  # x w_out: BLAS is faster with the narrow side first
-
-
-def init_params(sizes: dict[str, list[int]], args: Args) -> dict[str, torch.Tensor]:
-    """Orthogonal weights, (in, out), of gain sqrt 2 (outputs: actor 0.01, critic 1), zero biases, and log_std."""
-    generator = torch.Generator().manual_seed(args.seed)
-    params = {}
-    for name, output_gain in (("actor", 0.01), ("critic", 1.0)):
-        *hidden, output = zip(sizes[name], sizes[name][1:])
-        for i, (shape, gain) in enumerate([*((shape, math.sqrt(2)) for shape in hidden), (output, output_gain)]):
-            params[f"{name}.{i}.weight"] = torch.nn.init.orthogonal_(torch.empty(shape), gain, generator)
-            params[f"{name}.{i}.bias"] = torch.zeros(shape[1])
-    params["log_std"] = torch.full((sizes["actor"][-1],), args.log_std_init)
-    return params
-
-
-def init_moments(params: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Adam's running averages of every parameter's gradient and of its square."""
-    return {f"{name}.{moment}": torch.zeros_like(p) for name, p in params.items() for moment in ("mean", "square")}
-
-
-def layers(params: dict, name: str) -> list[tuple]:
-    """The (weight, bias) pairs of the network `name`, first to last."""
-    tensors = [p for key, p in params.items() if key.startswith(name)]
-    return list(zip(tensors[::2], tensors[1::2]))
-
-
-def critic_value(weights: list, obs: torch.Tensor) -> torch.Tensor:
-    """V(s), (batch,), of normalised observations (batch, obs_dim)."""
-    *hidden, (w_out, b_out) = weights
-    for w, b in hidden:
-        obs = torch.tanh(obs @ w + b)
-    return (w_out.T @ obs.T).squeeze(0) + b_out
-
-
-class Agent:
-    """The policy, the value function and the normaliser: all that a checkpoint needs to act."""
-
-    def __init__(self, obs_space: gym.spaces.Box, action_space: gym.spaces.Box, args: Args):
-        self.args, self.device = args, torch.device("cuda" if args.cuda else "cpu")
-        self.low, self.high = action_space.low, action_space.high
-        obs_dim, action_dim = obs_space.shape[0], action_space.shape[0]
-        self.actor = Actor(obs_dim, action_dim, args)
-        sizes = {"actor": self.actor.sizes, "critic": [obs_dim, *args.critic_hidden, 1]}
-        self.params = {name: p.to(self.device) for name, p in init_params(sizes, args).items()}
-        self.normalizer = Normalizer(args.num_envs, obs_dim, args)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The parameters to act with: on the CPU views that follow every update, on a GPU copies."""
-        return {name: p.cpu().numpy() for name, p in self.params.items()}
-
-    def tensors(self) -> dict[str, dict[str, torch.Tensor]]:
-        return {"params": self.params, "normalizer": self.normalizer.tensors()}
-
-    def load(self, checkpoint: dict):
-        for part, tensors in self.tensors().items():
-            copy_into(tensors, checkpoint[part])
-
-
-def copy_into(tensors: dict[str, torch.Tensor], saved: dict[str, torch.Tensor]):
-    """Copy saved tensors in place; ValueError if they are not the same ones."""
-    if {name: x.shape for name, x in tensors.items()} != {name: x.shape for name, x in saved.items()}:
-        raise ValueError
-    for name, tensor in tensors.items():
-        tensor.copy_(saved[name])
+    def load(self, state: dict[str, torch.Tensor]):
+        copy_into(self.state(), state)
 
 
 # --- Rollout and advantages -------------------------------------------------------------------------------------------
@@ -486,47 +421,52 @@ class Rollout:
     """T steps in N environments, and the episodes that ended in them."""
 
     obs: np.ndarray  # (T + 1, N, obs_dim), normalised
-    next_obs: np.ndarray  # (T, N, obs_dim), raw, what each step led to: the last observation where an episode ended
     actions: np.ndarray  # (T, N, action_dim), before they are clipped to the bounds
     logprobs: np.ndarray  # (T, N)
     rewards: np.ndarray  # (T, N), raw
     terminated: np.ndarray  # (T, N)
     truncated: np.ndarray  # (T, N)
     final_obs: dict[tuple[int, int], np.ndarray]  # (t, i) -> last observation of the episode that ended, normalised
-    first_obs: dict[tuple[int, int], np.ndarray]  # (t, i) -> first observation of the episode that followed, raw
     episodes: list[tuple[int, float, int]]  # (steps into the rollout, raw return, length)
 
 
-def collect(agent: Agent, envs: Environments, obs: np.ndarray, num_steps: int, rng: np.random.Generator) -> Rollout:
-    """Act with a = m + exp(log_std) * noise from the normalised obs (N, obs_dim) on; values can wait for the batch.
+class Batch(NamedTuple):
+    """A rollout's transitions in one row of T * N, or a minibatch of them, float32."""
+
+    obs: torch.Tensor  # (batch, obs_dim), normalised
+    actions: torch.Tensor  # (batch, action_dim)
+    logprobs: torch.Tensor  # (batch,), under the policy that acted; so are the values
+    advantages: torch.Tensor  # (batch,)
+    returns: torch.Tensor  # (batch,)
+    values: torch.Tensor  # (batch,)
+
+
+def collect(agent: Agent, envs: Environments, num_steps: int, rng: np.random.Generator) -> Rollout:
+    """Act with a = m(s) + exp(log_std) * noise; what acting does not need, as the values, is computed later, at once.
 
     The actor runs in NumPy: for one observation torch's overhead per call is larger than the arithmetic.
     """
     arrays = agent.arrays()
-    weights, log_std, num_envs = layers(arrays, "actor"), arrays["log_std"], len(obs)
-    noise = rng.standard_normal((num_steps, num_envs, len(log_std)), dtype=np.float32)
+    weights, log_std, obs = layers(arrays, "actor"), arrays["log_std"], agent.normalizer.normalize(envs.obs)
+    noise = rng.standard_normal((num_steps, len(obs), len(log_std)), dtype=np.float32)
     perturbation = noise * np.exp(log_std)
-    # the density of a depends on the noise alone: a - m = exp(log_std) * noise
+    # the density of a depends on the noise alone: a - m(s) = exp(log_std) * noise
     logprobs = -(0.5 * noise**2 + log_std + 0.5 * math.log(2 * math.pi)).sum(-1)
     all_obs, actions = np.empty((num_steps + 1, *obs.shape), np.float32), np.empty_like(noise)
-    next_obs = np.empty((num_steps, *obs.shape))
-    outcomes, final_obs, first_obs, episodes = [], {}, {}, []
+    outcomes, final_obs, episodes = [], {}, []
     for t in range(num_steps):
         all_obs[t] = obs
-        actions[t] = agent.actor.mean(weights, obs) + perturbation[t]
+        actions[t] = policy_mean(weights, obs) + perturbation[t]
         raw_obs, *outcome, ended = envs.step(np.minimum(np.maximum(actions[t], agent.low), agent.high))
         outcomes.append(outcome)
-        next_obs[t] = raw_obs
         if ended:  # last observations are counted too, before the ones that follow, as in gymnasium's wrapper
-            next_obs[t, list(ended)] = [last for last, _, _ in ended.values()]
-            last_obs = agent.normalizer.observe(next_obs[t, list(ended)])
+            last_obs = agent.normalizer.observe(np.stack([last for last, _, _ in ended.values()]))
             final_obs |= {(t, i): last for i, last in zip(ended, last_obs)}
-            first_obs |= {(t, i): raw_obs[i].copy() for i in ended}
-            episodes += [((t + 1) * num_envs, episode_return, length) for _, episode_return, length in ended.values()]
+            episodes += [((t + 1) * len(obs), episode_return, length) for _, episode_return, length in ended.values()]
         obs = agent.normalizer.observe(raw_obs)
     all_obs[-1] = obs
-    rewards, *ends = map(np.array, zip(*outcomes))
-    return Rollout(all_obs, next_obs, actions, logprobs, rewards.astype(float), *ends, final_obs, first_obs, episodes)
+    rewards, terminated, truncated = map(np.array, zip(*outcomes))
+    return Rollout(all_obs, actions, logprobs, rewards, terminated, truncated, final_obs, episodes)
 
 
 def gae(rewards: np.ndarray, values: np.ndarray, ends: np.ndarray, gamma: float, gae_lambda: float) -> np.ndarray:
@@ -539,23 +479,23 @@ def gae(rewards: np.ndarray, values: np.ndarray, ends: np.ndarray, gamma: float,
     return discounted_sums(delta[::-1], gae_lambda * discount[::-1], np.zeros(len(delta[0])))[::-1]
 
 
-def prepare_batch(agent: Agent, roll: Rollout) -> tuple[list[torch.Tensor], float]:
-    """A rollout's tensors for `update`, each (T * N, ...), and the explained variance of the value function."""
+def prepare_batch(agent: Agent, rollout: Rollout) -> tuple[Batch, float]:
+    """A rollout's transitions for `learn`, and the explained variance of the value function."""
     args, weights = agent.args, layers(agent.params, "critic")
-    obs = torch.from_numpy(roll.obs).to(agent.device)
+    obs = torch.from_numpy(rollout.obs).to(agent.device)
     values = critic_value(weights, obs.flatten(0, 1)).view(obs.shape[:2]).cpu().numpy()
-    rewards = agent.normalizer.scale_rewards(roll.rewards, roll.terminated)
-    cut = [at for at in roll.final_obs if not roll.terminated[at]] if args.bootstrap_truncated else []
+    rewards = agent.normalizer.scale_rewards(rollout.rewards, rollout.terminated)
+    cut = [at for at in rollout.final_obs if not rollout.terminated[at]] if args.bootstrap_truncated else []
     if cut:
-        final_obs = torch.from_numpy(np.stack([roll.final_obs[at] for at in cut])).to(agent.device)
+        final_obs = torch.from_numpy(np.stack([rollout.final_obs[at] for at in cut])).to(agent.device)
         for at, value in zip(cut, critic_value(weights, final_obs).tolist()):
             rewards[at] += args.gamma * value
-    advantages = gae(rewards, values, roll.terminated | roll.truncated, args.gamma, args.gae_lambda)
+    advantages = gae(rewards, values, rollout.terminated | rollout.truncated, args.gamma, args.gae_lambda)
     returns = advantages + values[:-1]
-    arrays = (roll.obs[:-1], roll.actions, roll.logprobs, advantages, returns, values[:-1])
-    flat = (x.reshape(args.batch_size, *x.shape[2:]).astype(np.float32) for x in arrays)
     explained_variance = 1 - advantages.var() / returns.var() if returns.var() else math.nan
-    return [torch.from_numpy(x).to(agent.device) for x in flat], explained_variance
+    arrays = (rollout.actions, rollout.logprobs, advantages, returns, values[:-1])
+    flat = (torch.from_numpy(x.reshape(args.batch_size, *x.shape[2:]).astype(np.float32)) for x in arrays)
+    return Batch(obs[:-1].flatten(0, 1), *(x.to(agent.device) for x in flat)), explained_variance
 
 
 # --- Update -----------------------------------------------------------------------------------------------------------
@@ -563,22 +503,24 @@ def prepare_batch(agent: Agent, roll: Rollout) -> tuple[list[torch.Tensor], floa
 LOSSES = ("policy_loss", "value_loss", "entropy", "old_approx_kl", "approx_kl", "clipfrac", "grad_norm")
 
 
-def ppo_loss(params, actor: Actor, args: Args, obs, actions, logprobs, advantages, returns, values):
-    """PPO's loss on a minibatch, the tensors of which are (batch, ...), and the first six of LOSSES."""
+def ppo_loss(params: dict, args: Args, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
+    """PPO's loss on a minibatch, and the first six of LOSSES."""
     log_std = params["log_std"]
-    z = (actions - actor.mean(layers(params, "actor"), obs)) * torch.exp(-log_std)
-    logratio = -(0.5 * z**2 + log_std + 0.5 * math.log(2 * math.pi)).sum(-1) - logprobs
+    mean = policy_mean(layers(params, "actor"), batch.obs)
+    z = (batch.actions - mean) * torch.exp(-log_std)
+    logratio = -(0.5 * z**2 + log_std + 0.5 * math.log(2 * math.pi)).sum(-1) - batch.logprobs
     ratio = logratio.exp()
+    advantages = batch.advantages
     if args.norm_adv:
         advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
     clipped_ratio = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
     policy_loss = -torch.minimum(advantages * ratio, advantages * clipped_ratio).mean()
 
-    new_values = critic_value(layers(params, "critic"), obs)
-    value_errors = (new_values - returns) ** 2
+    values = critic_value(layers(params, "critic"), batch.obs)
+    value_errors = (values - batch.returns) ** 2
     if args.clip_vloss:
-        clipped_values = values + (new_values - values).clamp(-args.clip_coef, args.clip_coef)
-        value_errors = torch.maximum(value_errors, (clipped_values - returns) ** 2)
+        clipped_values = batch.values + (values - batch.values).clamp(-args.clip_coef, args.clip_coef)
+        value_errors = torch.maximum(value_errors, (clipped_values - batch.returns) ** 2)
     value_loss = 0.5 * value_errors.mean()
 
     entropy = (log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()
@@ -588,125 +530,178 @@ def ppo_loss(params, actor: Actor, args: Args, obs, actions, logprobs, advantage
     return loss, torch.stack(losses).detach()
 
 
-def update(params, moments, actor: Actor, args: Args, batch: list, index, step_size) -> torch.Tensor:
-    """One minibatch: loss, gradient, clipping, and Adam with eps 1e-5, in place on `params` and `moments`.
+class Adam:
+    """The state of Adam: the running averages of every parameter's gradient and of its square, and the step count."""
 
-    index: the minibatch's rows of `batch`; moments: Adam's two averages of every parameter's gradient, as
-    `init_moments` makes them; step_size: from `adam_step_sizes`. Returns LOSSES. Written out, instead of with
-    torch.optim, so that all of it is one graph for torch.compile.
+    def __init__(self, params: dict[str, torch.Tensor]):
+        names = [(name, moment) for name in params for moment in ("mean", "square")]
+        self.moments = {f"{name}.{moment}": torch.zeros_like(params[name]) for name, moment in names}
+        self.steps = 0
+
+    def step_sizes(self, learning_rate: float, count: int) -> torch.Tensor:
+        """(count, 2), for the next `count` steps t: lr / (1 - beta1^t) and 1 / sqrt(1 - beta2^t)."""
+        t = np.arange(self.steps + 1, self.steps + count + 1)
+        sizes = np.stack([learning_rate / (1 - 0.9**t), 1 / np.sqrt(1 - 0.999**t)], axis=1)
+        return torch.from_numpy(sizes.astype(np.float32))
+
+    def state(self) -> dict:
+        return {"moments": self.moments, "steps": self.steps}
+
+    def load(self, state: dict):
+        copy_into(self.moments, state["moments"])
+        self.steps = state["steps"]
+
+
+def update(params: dict, moments: dict, args: Args, batch: Batch, index, step_size: torch.Tensor) -> torch.Tensor:
+    """One minibatch: loss, gradient, clipping, and Adam with eps 1e-5, in place on `params` and Adam's `moments`.
+
+    index: the minibatch's rows of `batch`; step_size: a row of `Adam.step_sizes`. Returns LOSSES. Written out, instead
+    of with torch.optim, so that all of it is one graph for torch.compile.
     """
-    grads, losses = torch.func.grad(ppo_loss, has_aux=True)(params, actor, args, *(x[index] for x in batch))
+    minibatch = Batch(*(x[index] for x in batch))
+    grads, losses = torch.func.grad(ppo_loss, has_aux=True)(params, args, minibatch)
     norm = sum(g.square().sum() for g in grads.values()).sqrt()
     scale = (args.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
+    size, root_scale = step_size[0], step_size[1]
     for name, p in params.items():
         grad, mean, square = grads[name] * scale, moments[f"{name}.mean"], moments[f"{name}.square"]
         mean.lerp_(grad, 1 - 0.9)
         square.lerp_(grad.square(), 1 - 0.999)
-        p.sub_(step_size[0] * mean / (square.sqrt() * step_size[1] + 1e-5))
+        p.sub_(size * mean / (square.sqrt() * root_scale + 1e-5))
     return torch.cat([losses, norm[None]])
 
 
-def adam_step_sizes(learning_rate: float, first: int, count: int) -> np.ndarray:
-    """(count, 2): lr / (1 - beta1^t) and 1 / sqrt(1 - beta2^t), Adam's bias corrections, from step t = `first` on."""
-    t = np.arange(first, first + count)
-    return np.stack([learning_rate / (1 - 0.9**t), 1 / np.sqrt(1 - 0.999**t)], axis=1)
-
-
-def learn(update_function, agent: Agent, moments, batch: list, rng, learning_rate: float, adam_steps: int):
-    """The epochs over one rollout, after `adam_steps` earlier minibatches: the mean LOSSES and how many there were."""
-    args, losses = agent.args, []
-    sizes = adam_step_sizes(learning_rate, adam_steps + 1, args.update_epochs * args.num_minibatches)
-    sizes = torch.from_numpy(sizes.astype(np.float32)).to(agent.device).unbind()
+def learn(update_function, training: "Training", batch: Batch, learning_rate: float) -> dict[str, float]:
+    """The epochs over one rollout: the means of LOSSES over their minibatches."""
+    agent, adam, args, losses = training.agent, training.adam, training.agent.args, []
+    step_sizes = adam.step_sizes(learning_rate, args.update_epochs * args.num_minibatches).to(agent.device).unbind()
     for _ in range(args.update_epochs):
-        order = torch.from_numpy(rng.permutation(args.batch_size)).to(agent.device)
+        order = torch.from_numpy(training.rng.permutation(args.batch_size)).to(agent.device)
         for index in order.split(args.batch_size // args.num_minibatches):
-            out = update_function(agent.params, moments, agent.actor, args, batch, index, sizes[len(losses)])
-            losses.append(out.clone() if args.cuda else out)  # a CUDA graph's next output comes to the same place
+            step_size = step_sizes[len(losses)]
+            losses.append(update_function(agent.params, adam.moments, args, batch, index, step_size))
         if args.target_kl is not None and losses[-1][LOSSES.index("approx_kl")] > args.target_kl:
             break
-    return torch.stack(losses).mean(0).tolist(), len(losses)
+    adam.steps += len(losses)
+    means = {f"losses/{name}": mean for name, mean in zip(LOSSES, torch.stack(losses).mean(0).tolist())}
+    check_finite("the update", means | agent.params | agent.normalizer.state())
+    return means
 
 
-def compile_update(agent: Agent, moments) -> tuple:
-    """(the compiled `update`, True), or, where compilation fails, (`update`, False) with one line that says why.
-
-    It is compiled by running it once on zeros; parameters and moments are restored. Shapes never change in a run, so
-    the guards against that are skipped. On a GPU the whole call is replayed as a CUDA graph.
-    """
-    args, tensors = agent.args, [*agent.params.values(), *moments.values()]
-    obs_dim, action_dim = len(agent.params["critic.0.weight"]), len(agent.params["log_std"])
-    batch = [torch.zeros(args.batch_size, *shape, device=agent.device)
-             for shape in ((obs_dim,), (action_dim,), (), (), (), ())]  # fmt: skip
-    index = torch.arange(args.batch_size // args.num_minibatches, device=agent.device)
-    if args.cuda:
-        options = {"triton.cudagraphs": True}
-        for x in tensors:
-            torch._dynamo.mark_static_address(x)  # a graph may update in place only what never moves
-    else:  # C++ calls the kernels; tanh from exp; and on small matrices a bias in the next kernel is faster than addmm
-        options = {"cpp_wrapper": True, "cpp.use_decompose_tanh": True, "pattern_matcher": False}
-    options["guard_filter_fn"] = torch.compiler.skip_all_guards_unsafe
-    start, before = time.time(), [x.clone() for x in tensors]
-    print("compiling the update (up to a minute the first time, seconds from the cache after that) ...", flush=True)
-
-    def run_once():
-        compiled = torch.compile(update, fullgraph=True, dynamic=False, options=options)
-        compiled(agent.params, moments, agent.actor, args, batch, index, torch.ones(2, device=agent.device))
-        return compiled
-
-    try:
-        try:
-            compiled = run_once()
-        except Exception:  # whoever was killed while compiling may have left half a library in the cache
-            from torch._inductor.utils import fresh_cache  # takes seconds
-
-            torch._dynamo.reset()
-            with fresh_cache():
-                compiled = run_once()
-    except Exception as error:  # no C++ compiler, no Python headers, ...: whatever it is, training can go on
-        print(f"compilation failed, training goes on uncompiled: {first_line(error)}", flush=True)
-        return update, False
-    for x, old in zip(tensors, before):
-        x.copy_(old)
-    print(f"compiled in {time.time() - start:.0f} s", flush=True)
-    return compiled, True
+# --- Main -------------------------------------------------------------------------------------------------------------
 
 
-# --- Evaluation -------------------------------------------------------------------------------------------------------
+@dataclass
+class Progress:
+    """How far a training is."""
+
+    global_step: int = 0  # environment steps, over all environments together
+    best_return: float = -math.inf  # of the evaluations
+    evaluations: list[tuple] = field(default_factory=list)  # the rows of evaluations.csv
+    late_returns: list[float] = field(default_factory=list)  # of training episodes in the last tenth of the steps
+    train_seconds: float = 0.0  # in rollouts and updates
+    wall_seconds: float = 0.0
+    wandb_id: str | None = None
+
+
+class Training:
+    """All that training changes, and so all that last.pt holds."""
+
+    def __init__(self, args: Args):
+        seed_global_rng(args.seed)
+        self.envs = Environments(args)
+        self.agent = Agent(self.envs.envs[0].observation_space, self.envs.envs[0].action_space, args)
+        self.agent.normalizer.observe(self.envs.obs)
+        self.adam = Adam(self.agent.params)
+        self.rng = np.random.default_rng(args.seed)  # of the action noise and of the minibatches
+        self.progress = Progress()
+
+    def state(self) -> dict:
+        parts = {"adam": self.adam.state(), "envs": self.envs.state(), "rng": self.rng.bit_generator.state}
+        return self.agent.state() | parts | {"global_rng": global_rng_state(), "progress": asdict(self.progress)}
+
+    def load(self, state: dict):
+        self.agent.load(state)
+        self.adam.load(state["adam"])
+        self.envs.load(state["envs"])
+        self.rng.bit_generator.state = state["rng"]
+        set_global_rng(state["global_rng"])  # after the replay, which may draw from it
+        self.progress = Progress(**state["progress"])
+
+
+def main():
+    args = tyro.cli(Args, description=__doc__)
+    if args.evaluate is not None:
+        return evaluate_checkpoint(args)
+    catch_signals()
+    check_args(args)
+    with Run(args) as run:
+        training = run.begin_or_resume()
+        agent, envs, progress = training.agent, training.envs, training.progress
+        update_function = run.compile(training)
+        run.evaluate_if_due(training)  # due here if the run was stopped in the middle of it
+        while progress.global_step < args.last_step:
+            start, before = time.time(), progress.global_step
+            rollout = collect(agent, envs, args.num_steps, training.rng)
+            batch, explained_variance = prepare_batch(agent, rollout)
+            learning_rate = args.learning_rate * (1 - before / args.last_step if args.anneal_lr else 1)
+            scalars = learn(update_function, training, batch, learning_rate)
+            progress.global_step = step = before + args.batch_size
+            progress.train_seconds += time.time() - start
+
+            scalars["losses/explained_variance"] = explained_variance
+            scalars["charts/learning_rate"] = learning_rate
+            scalars["charts/SPS"] = step / progress.train_seconds
+            run.log(training, scalars, [(before + offset, *episode) for offset, *episode in rollout.episodes])
+            run.evaluate_if_due(training)
+            if passed(args.save_every, before, step):
+                run.save(f"step_{step}.pt", training)
+            if passed(args.checkpoint_interval, before, step) or step == args.last_step or stop_signals:
+                run.save_last(training)
+                run.exit_if_stopped()
+        run.finish(training)
+
+
+# --- Nothing below is the algorithm: logs, evaluation, tasks, arguments, compilation, files and signals ---------------
+
+
+def passed(interval: int | None, before: int, now: int) -> bool:
+    """Whether a multiple of the interval lies in (before, now]; never, if there is no interval."""
+    return interval is not None and now // interval > before // interval
 
 
 def evaluate(agent: Agent, seeds: list[int], render_mode: str | None = None, videos: Path | None = None):
-    """Returns and lengths of one episode per seed under the deterministic policy a = m (Algorithm 1, line 9).
+    """Returns and lengths, (len(seeds),), of one episode per seed, acting with `agent.act` in new environments.
 
-    The environments are new, the normaliser is frozen, and no random stream of the training is touched. The episodes
-    run side by side, or in a window one after the other; each keeps its row, so that the numbers are the same.
+    The normalizer is frozen, and no random stream of the training is touched. The episodes run side by side, in a
+    window one after the other. A signal ends it at once, with what there is.
     """
-    envs = [make_env(agent.args.env_id, render_mode) for _ in seeds]
-    if videos:
-        envs = [gym.wrappers.RecordVideo(env, str(videos), lambda _: True, name_prefix=f"episode-{i}",
-                                         disable_logger=True) for i, env in enumerate(envs)]  # fmt: skip
-    weights, everyone = layers(agent.arrays(), "actor"), list(range(len(seeds)))
-    obs = np.zeros((len(seeds), *envs[0].observation_space.shape))
-    returns, lengths = np.zeros(len(seeds)), np.zeros(len(seeds), int)
-    for running in [[i] for i in everyone] if render_mode == "human" else [everyone]:
-        for i in running:
-            obs[i], _ = envs[i].reset(seed=seeds[i])
-        while running:
-            returns[~np.isfinite(obs).all(-1)] = math.nan
-            actions = np.clip(agent.actor.mean(weights, agent.normalizer.normalize(obs)), agent.low, agent.high)
-            for i in running[:]:
-                obs[i], reward, terminated, truncated, _ = envs[i].step(actions[i])
-                returns[i] += float(reward)
+    returns, lengths, rng_state = np.zeros(len(seeds)), np.zeros(len(seeds), int), global_rng_state()
+    seed_global_rng(seeds[0])
+    groups = [[i] for i in range(len(seeds))] if render_mode == "human" else [range(len(seeds))]
+    for group in groups:
+        envs = {i: make_env(agent.args, render_mode, evaluation_episode=i) for i in group}
+        if videos:
+            options = {"video_folder": str(videos), "episode_trigger": lambda _: True, "disable_logger": True}
+            envs = {i: gym.wrappers.RecordVideo(env, name_prefix=f"episode-{i}", **options) for i, env in envs.items()}
+        obs = {i: env.reset(seed=seeds[i])[0] for i, env in envs.items()}
+        while obs and not stop_signals:
+            for i, action in zip(list(obs), agent.act(np.stack(list(obs.values())))):
+                obs[i], reward, terminated, truncated, _ = envs[i].step(action)
+                returns[i] += reward
                 lengths[i] += 1
                 if terminated or truncated:
-                    running.remove(i)
-                    envs[i].close()
+                    del obs[i]
+        for env in envs.values():
+            env.close()
+    set_global_rng(rng_state)
     return returns, lengths
 
 
 def evaluation_seeds(args: Args, global_step: int, final: bool = False) -> list[int]:
     """Odd seeds for a final evaluation, even ones for those during training, so that no seed serves both."""
     count = args.final_eval_episodes if final else args.eval_episodes
-    return [s & ~1 | final for s in episode_seeds(args.seed, 1, global_step, count=count)]
+    return [seed - seed % 2 + final for seed in episode_seeds(args.seed, 1, global_step, count=count)]
 
 
 def mean_and_std(x) -> tuple[float, float]:
@@ -714,29 +709,314 @@ def mean_and_std(x) -> tuple[float, float]:
     return float(np.mean(x)), float(np.std(x, ddof=1)) if len(x) > 1 else 0.0
 
 
-def evaluate_checkpoint(path: Path, given: Args):
+def evaluate_checkpoint(given: Args):
     """--evaluate: print a saved policy's returns, which for best.pt and last.pt are those in result.json."""
+    path, render_mode = Path(given.evaluate).expanduser(), "human" if given.render else None
     checkpoint = load_checkpoint(path)
-    own = ("evaluate", "final_eval_episodes", "render", "capture_video", "num_threads", "cuda", "track")
-    with refusing_damage(path):
-        args = Args(**checkpoint["args"] | {name: getattr(given, name) for name in own})
-        agent = Agent(*check_args(args), args)
-        agent.load(checkpoint)
-        seeds = evaluation_seeds(args, checkpoint["global_step"], final=True)
-    limit_threads(args)
+    own = ("evaluate", "final_eval_episodes", "render", "capture_video", "num_threads", "cuda")
+    args = replace(Args(**checkpoint["args"]), **{name: getattr(given, name) for name in own})
+    check_args(args)
     videos = path.with_suffix(".videos") if args.capture_video else None
     if videos and videos.exists():
         refuse(f"{videos} exists already; move it away to record again")
-    returns, lengths = evaluate(agent, seeds, "human" if args.render else "rgb_array" if videos else None, videos)
+    seeds = evaluation_seeds(args, checkpoint["global_step"], final=True)
+    returns, lengths = evaluate(agent_of(checkpoint, args), seeds, "rgb_array" if videos else render_mode, videos)
     for i, (episode_return, length) in enumerate(zip(returns, lengths), start=1):
-        print(f"episode {i}: return {episode_return:.3f}, length {length}")
+        say(f"episode {i}: return {episode_return:.3f}, length {length}")
     mean, std = mean_and_std(returns)
-    print(f"step {checkpoint['global_step']:,}: mean return {mean:.3f}, std {std:.3f} (ddof 1)")
+    say(f"step {checkpoint['global_step']:,}: mean return {mean:.3f}, std {std:.3f} (ddof 1)")
     if videos:
-        print(f"videos are in {videos}")
+        say(f"videos are in {videos}")
 
 
-# --- Files of a run ---------------------------------------------------------------------------------------------------
+# --- The boundary between a task and everything else ------------------------------------------------------------------
+
+mujoco_warnings: list[str] = []  # where MuJoCo reports an unstable simulation, which it otherwise hides
+mujoco.set_mju_user_warning(mujoco_warnings.append)
+open_tasks: list["Task"] = []
+
+
+class NotFinite(Exception):
+    """A number is not finite; `facts` say what it is, and where it is met again."""
+
+    def __init__(self, **facts):
+        super().__init__(f"not finite: {facts}")
+        self.facts = facts
+
+
+def check_finite(what: str, numbers: dict):
+    """NotFinite, with their names, if any of these numbers and tensors are not."""
+    bad = [name for name, x in numbers.items() if not torch.as_tensor(x).isfinite().all()]
+    if bad:
+        values = {name: str(x) for name, x in numbers.items() if isinstance(x, float)}  # JSON has no NaN
+        raise NotFinite(what=what, not_finite=bad, **values)
+
+
+class Task(gym.Wrapper):
+    """One environment, held to what its spaces promise: all that comes from a task passes here.
+
+    Observations become float64 arrays of the space's shape (else ValueError), rewards floats, ends bools; the task gets
+    an action of its own in the space's dtype, which it may change. A number that is not finite raises NotFinite with
+    the episode's seed and the step in it, which replay it, and with `facts`.
+    """
+
+    def __init__(self, env: gym.Env, facts: dict):
+        super().__init__(env)
+        self.facts, self.episode_seed, self.episode_step = facts, None, 0
+        self.obs_shape, self.action_dtype = env.observation_space.shape, env.action_space.dtype
+        open_tasks.append(self)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        self.episode_seed, self.episode_step = seed, 0
+        self.unwrapped.action_space.seed(seed)  # some tasks draw from it
+        obs, info = ask(self.env.reset, seed=seed, options=options)
+        return self.checked(obs), info
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.episode_step += 1
+        obs, reward, terminated, truncated, info = ask(self.env.step, np.array(action, self.action_dtype))
+        reward = np.asarray(reward, float).item()
+        return self.checked(obs, reward), reward, bool(terminated), bool(truncated), info
+
+    def checked(self, obs, reward: float = 0.0) -> np.ndarray:
+        obs = np.array(obs, float)  # a copy: the task may go on writing into its own
+        if obs.shape != self.obs_shape:
+            raise ValueError(f"an observation has the shape {obs.shape}, where the space promises {self.obs_shape}")
+        if not math.isfinite(obs.dot(obs) + reward):  # the square of a large number may be infinite: look closer
+            for what, x in (("an observation", obs), ("a reward", reward)):
+                if not np.isfinite(x).all():
+                    replay = {"episode_seed": self.episode_seed, "episode_step": self.episode_step}
+                    raise NotFinite(what=what, **self.facts, **replay, value=str(x))
+        return obs
+
+    def close(self):
+        if self in open_tasks:  # once: a task may fail at the second time
+            open_tasks.remove(self)
+            super().close()
+
+
+def ask(method, *values, **named):
+    """What the task answers; one that ends the program (a missing licence, a closed window) has failed."""
+    try:
+        return method(*values, **named)
+    except SystemExit as stop:
+        raise RuntimeError(f"the task ended the program, with exit code {stop.code}") from stop
+
+
+def make_env(args: Args, render_mode: str | None = None, **facts) -> Task:
+    """One environment of the task; observations that are no vector are flattened, as CleanRL does.
+
+    `facts` are told where a number is not finite. What MuJoCo says of the model file while it loads is dropped.
+    """
+    seen, options = len(mujoco_warnings), {"max_episode_steps": args.max_episode_steps, "disable_env_checker": True}
+    if render_mode:  # a task need not know the keyword
+        options["render_mode"] = render_mode
+    env = ask(gym.make, args.env_id, **options)
+    del mujoco_warnings[seen:]
+    if not isinstance(env.observation_space, gym.spaces.Box) or len(env.observation_space.shape) != 1:
+        env = gym.wrappers.FlattenObservation(env)
+    return Task(env, facts)
+
+
+def episode_seeds(seed: int, *key: int, count: int = 1) -> list[int]:
+    """Seeds for `env.reset`, a stream of its own for every key: (0, env, episode) trains, (1, step) evaluates.
+
+    They have 31 bits, since some simulators keep theirs in a C int.
+    """
+    return (np.random.SeedSequence(seed, spawn_key=key).generate_state(count) >> 1).tolist()
+
+
+def seed_global_rng(seed: int):
+    """The generators that a task may draw from beside its own: Python's, NumPy's and torch's."""
+    random.seed(seed)
+    np.random.seed(seed % 2**32)
+    torch.manual_seed(seed)
+
+
+def global_rng_state() -> dict:
+    name, keys, *rest = np.random.get_state()
+    return {"python": random.getstate(), "numpy": (name, keys.tolist(), *rest), "torch": torch.get_rng_state()}
+
+
+def set_global_rng(state: dict):
+    random.setstate(state["python"])
+    np.random.set_state(state["numpy"])
+    torch.set_rng_state(state["torch"])
+
+
+# --- Arguments --------------------------------------------------------------------------------------------------------
+
+SCRIPT = Path(__file__).name
+EXIT_BAD_ARGUMENTS, EXIT_FAILURE, EXIT_STOPPED = 2, 3, 75
+POSITIVE, FRACTION = ("positive", lambda x: 0 < x < math.inf), ("between 0 and 1", lambda x: 0 <= x <= 1)
+RULES = {
+    **{int: ("at least 1", lambda x: x >= 1), float: ("a finite number", math.isfinite)},  # by type, and by name
+    **{"seed": ("from 0 to 2^63 - 1", lambda x: 0 <= x < 2**63), "gamma": FRACTION, "gae_lambda": FRACTION},
+    **dict.fromkeys(("learning_rate", "clip_coef", "max_grad_norm", "target_kl"), POSITIVE),
+}
+
+
+def say(text: str):
+    """Print a line, above the progress bar; a reader that has left (`| head`) does not end a training."""
+    try:
+        tqdm.write(text)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def refuse(sentence: str):
+    """End the program with one sentence about its input."""
+    print(f"{Path(sys.argv[0]).name}: error: {sentence}", file=sys.stderr)
+    raise SystemExit(EXIT_BAD_ARGUMENTS)
+
+
+def first_line(error: BaseException) -> str:
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)
+
+
+def check_args(args: Args):
+    """Refuse what cannot be trained or evaluated before any work starts; limit the threads, on which bits depend."""
+    for flag in fields(args):
+        value, name = getattr(args, flag.name), flag.name.replace("_", "-")
+        for x in value if isinstance(value, tuple) else (value,):
+            rule, holds = RULES.get(flag.name) or RULES.get(type(x)) or ("", lambda x: True)
+            if x is not None and not holds(x):
+                refuse(f"--{name} must be {rule}, not {value}")
+        if value == ():
+            refuse(f"--{name} must be at least 1 layer")
+    if args.batch_size % args.num_minibatches:
+        steps = f"{args.batch_size} steps ({args.num_envs} environments x {args.num_steps} steps)"
+        refuse(f"{args.num_minibatches} minibatches do not divide a rollout of {steps} evenly")
+    if args.batch_size == args.num_minibatches:
+        refuse("a minibatch must have at least 2 steps, to normalise its advantages; use fewer --num-minibatches")
+    if args.last_step < 1:
+        refuse(f"--total-timesteps {args.total_timesteps} is less than one rollout of {args.batch_size} steps")
+    if args.resume and not args.run_dir and not args.evaluate:
+        refuse("--resume needs --run-dir, the folder of the run to continue")
+    if args.render and not args.evaluate:
+        refuse("--render shows the episodes of --evaluate; training is not shown")
+    for extra, wanted, module in (("track", args.track, "wandb"), ("video", args.capture_video, "moviepy")):
+        if wanted and find_spec(module) is None:
+            refuse(f"the package {module} is missing: pip install -e '.[{extra}]'")
+    if args.cuda and not torch.cuda.is_available():
+        refuse("--cuda was asked for, but torch finds no CUDA device")
+    check_task(args)
+    torch.set_num_threads(args.num_threads)
+    threadpool_limits(args.num_threads)
+
+
+def check_task(args: Args):
+    """Refuse a task that breaks the rules of gymnasium's Env, or cannot be drawn; warn of what else is doubtful."""
+    render_mode = "human" if args.render else "rgb_array" if args.capture_video else None
+    with refusing(f"cannot make the task {args.env_id}"), warnings.catch_warnings(action="ignore"):
+        task = make_env(args, render_mode)  # its warnings are shown again when training makes its environments
+    actions, problems = task.action_space, []
+    if not (isinstance(actions, gym.spaces.Box) and len(actions.shape) == 1 and actions.dtype.kind == "f"):
+        refuse(f"{args.env_id} has actions in {actions}; only a one-dimensional Box of real numbers is supported")
+    with warnings.catch_warnings(record=True, action="always") as notes:
+        try:
+            check_env(task.unwrapped, skip_render_check=True, skip_close_check=True)
+        except (Exception, SystemExit) as error:  # whatever the checker or the task raises
+            problems.append(first_line(error))
+    problems += [str(note.message).partition("WARN: ")[2].removesuffix("\x1b[0m") for note in notes]
+    ours = ("infinity", "symmetric and normalized", "dtype")  # infinite bounds, ranges of actions, types of numbers
+    for problem in dict.fromkeys(problems):
+        if problem and not any(words in problem for words in ours):
+            say(f"warning: gymnasium's check_env says of {args.env_id}: {problem}")
+    with refusing(f"{args.env_id} does not work as gymnasium's Env should"), suppress(NotFinite):  # training says where
+        task.reset(seed=episode_seeds(args.seed, 2)[0])
+        task.step(actions.sample())
+    if render_mode:
+        with refusing(f"cannot draw {args.env_id} (MUJOCO_GL=egl or MUJOCO_GL=osmesa draws without a screen)"):
+            if task.render() is None and render_mode == "rgb_array":
+                raise ValueError("it gives no pictures as rgb_array")
+    others = f"training keeps {args.num_envs}, and an evaluation makes {args.eval_episodes} more"
+    with refusing(f"cannot make {args.env_id} a second time beside the first ({others})"):
+        make_env(args).close()
+    task.close()
+    std = math.exp(args.log_std_init)
+    reach = [
+        math.erf(high / std / 2**0.5) - math.erf(low / std / 2**0.5) for low, high in zip(actions.low, actions.high)
+    ]
+    if min(reach) < 0.02:
+        say(
+            f"warning: {args.env_id} has actions in {actions}, where a policy that starts as Normal(0, {std:.2g}) "
+            "hardly ever gets; rescale them to -1 .. 1 with gymnasium's RescaleAction"
+        )
+    if task.spec.max_episode_steps is None and not args.evaluate:
+        say(
+            f"warning: {args.env_id} has no time limit: evaluations wait for their episodes to end, and "
+            "--resume replays the running one, however long; --max-episode-steps sets a limit"
+        )
+
+
+@contextmanager
+def refusing(sentence: str):
+    """What fails in the block is refused; an error that arose in the task's own code keeps its traceback."""
+    try:
+        yield
+    except NotFinite:
+        raise
+    except Exception as error:  # whatever gymnasium or the task raises
+        innermost = Path(traceback.extract_tb(error.__traceback__)[-1].filename)
+        if Path(gym.__file__).parent not in innermost.parents and innermost != Path(__file__):
+            traceback.print_exception(error)
+        refuse(f"{sentence}: {first_line(error)}")
+
+
+# --- Compilation ------------------------------------------------------------------------------------------------------
+
+
+def compile_update(training: Training):
+    """The compiled `update`, or None, with one line that says why, where it cannot be compiled.
+
+    It is compiled by running it once on zeros; parameters and moments are restored. Shapes never change in a run, so
+    all guards are skipped: the compiled function keeps every number that it saw at this first call. What is to change
+    while training must therefore be a tensor, which it reads anew at every call. So, to anneal the entropy bonus, set
+    `agent.args = replace(args, ent_coef=torch.tensor(0.01))` before this, and call its `fill_` in main's loop.
+    """
+    agent, moments = training.agent, training.adam.moments
+    args, tensors = agent.args, [*agent.params.values(), *moments.values()]
+    shapes = (len(agent.params["critic.0.weight"]),), (len(agent.params["log_std"]),), (), (), (), ()
+    batch = Batch(*(torch.zeros(args.batch_size, *shape, device=agent.device) for shape in shapes))
+    index = torch.arange(args.batch_size // args.num_minibatches, device=agent.device)
+    step_size = torch.ones(2, device=agent.device)
+    options = {"guard_filter_fn": torch.compiler.skip_all_guards_unsafe}
+    if not args.cuda:  # C++ calls the kernels; tanh from exp; on small matrices a bias in the next kernel beats addmm
+        options |= {"cpp_wrapper": True, "cpp.use_decompose_tanh": True, "pattern_matcher": False}
+    start, before = time.time(), [x.clone() for x in tensors]
+    say("compiling the update (up to a minute the first time, seconds from the cache after that) ...")
+
+    def compile_and_run():
+        compiled = torch.compile(update, fullgraph=True, dynamic=False, options=options)
+        compiled(agent.params, moments, args, batch, index, step_size)
+        return compiled
+
+    try:
+        try:
+            compiled = compile_and_run()
+        except Exception:  # whoever was killed while compiling may have left half a library in the cache
+            from torch._inductor.utils import fresh_cache  # takes seconds
+
+            torch._dynamo.reset()
+            with tempfile.TemporaryDirectory() as folder, fresh_cache(dir=folder):
+                compiled = compile_and_run()
+    except Exception as error:  # no C++ compiler, no Python headers, ...: whatever it is, training can go on
+        lines = str(error).splitlines()
+        line = next((line for line in lines if " error: " in line), first_line(error))  # the C++ compiler's own
+        say(f"compilation failed, training goes on uncompiled: {line}")
+        return None
+    for x, old in zip(tensors, before):
+        x.copy_(old)
+    if not torch._dynamo.utils.counters["stats"]["unique_graphs"]:
+        say("torch.compile is switched off (TORCHDYNAMO_DISABLE?), training goes on uncompiled")
+        return None
+    say(f"compiled in {time.time() - start:.0f} s")
+    return compiled
+
+
+# --- Checkpoints ------------------------------------------------------------------------------------------------------
 
 
 def write_atomically(path: Path, data: bytes):
@@ -760,15 +1040,6 @@ def save_checkpoint(path: Path, state: dict):
     write_atomically(path, buffer.getvalue())
 
 
-@contextmanager
-def refusing_damage(path: Path):
-    """Refuse the checkpoint if what is done with it fails; torn, foreign and malicious ones fail in many ways."""
-    try:
-        yield
-    except Exception:
-        refuse(f"{path} is damaged or not a checkpoint of {SCRIPT}")
-
-
 def load_checkpoint(path: Path) -> dict:
     """What `save_checkpoint` wrote, on the CPU, or a refusal.
 
@@ -776,20 +1047,45 @@ def load_checkpoint(path: Path) -> dict:
     """
     if not path.is_file():
         refuse(f"there is no checkpoint {path}")
-    with refusing_damage(path):
-        if zipfile.ZipFile(path).testzip():  # torch.load looks at no checksum
-            raise ValueError
+    try:
+        torn = zipfile.ZipFile(path).testzip()  # torch.load looks at no checksum
         state = torch.load(path, map_location="cpu", weights_only=True)
-        if not state.keys() >= {"args", "global_step", "params", "normalizer"}:
-            raise ValueError
-        flags = set(state["args"])
-    if flags != {field.name for field in fields(Args)}:
+    except Exception:  # torn, foreign and malicious files fail in many ways
+        torn, state = True, None
+    if torn or not isinstance(state, dict) or not state.keys() >= {"args", "global_step", "params", "normalizer"}:
+        refuse(f"{path} is damaged or not a checkpoint of {SCRIPT}")
+    if state["args"].keys() != {flag.name for flag in fields(Args)}:
         refuse(f"{path} was not written by this {SCRIPT}: it has other flags")
     return state
 
 
+def copy_into(tensors: dict[str, torch.Tensor], saved: dict[str, torch.Tensor]):
+    """Copy a checkpoint's tensors in place, or refuse it if they are not of the same names and shapes."""
+    for name in tensors.keys() | saved.keys():
+        have, want = (tuple(x[name].shape) if name in x else "missing" for x in (saved, tensors))
+        if have != want:
+            refuse(f"the checkpoint does not fit this {SCRIPT}: {name} is {have} there, and {want} here")
+    for name, tensor in tensors.items():
+        tensor.copy_(saved[name])
+
+
+def load_agent(path: str | Path) -> Agent:
+    """The agent of a checkpoint (best.pt, last.pt, step_N.pt): `action = load_agent(path).act(obs)`."""
+    checkpoint = load_checkpoint(Path(path).expanduser())
+    return agent_of(checkpoint, replace(Args(**checkpoint["args"]), cuda=False))
+
+
+def agent_of(checkpoint: dict, args: Args) -> Agent:
+    with refusing(f"cannot make the task {args.env_id}"):
+        task = make_env(args)
+    task.close()
+    agent = Agent(task.observation_space, task.action_space, args)
+    agent.load(checkpoint)
+    return agent
+
+
 def describe_machine() -> dict:
-    """Versions, commit and hardware, for config.json."""
+    """Versions, commit and hardware: what the numbers of a run may depend on beside its flags."""
     git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
     commit = subprocess.run(git, capture_output=True, text=True).stdout.strip() if shutil.which("git") else ""
     cpu = Path("/proc/cpuinfo").read_text() if sys.platform == "linux" else ""
@@ -802,277 +1098,265 @@ def describe_machine() -> dict:
     }
 
 
-RESUMED = {"moments", "envs", "rng", "progress", "compiled"}  # what last.pt holds beyond the agent
+# --- The run's folder -------------------------------------------------------------------------------------------------
+
+FREE_ON_RESUME = {"resume", "run_dir", "progress", "track", "capture_video", "checkpoint_interval", "save_every"}
+RESUMED = {"adam", "envs", "rng", "global_rng", "progress", "compiled", "machine"}  # in last.pt alone
 
 
-def changed_flags(args: dict, others: dict) -> list[str]:
-    """The flags that a run cannot change when it is continued, and which differ."""
-    if args.keys() != others.keys():
-        raise KeyError
-    return [name for name in args if name not in FREE_ON_RESUME and args[name] != others[name]]
+class Run:
+    """The folder of a run: locked while it is at work, never overwritten; what is written there, and how it ends."""
 
-
-def open_run(args: Args) -> tuple[Path, dict | None]:
-    """The run's folder, made if need be, and the checkpoint to continue from, if any. Never overwrites a run."""
-    run_dir = Path(args.run_dir or f"runs/{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}")
-    config = json.loads(json.dumps({"args": asdict(args), **describe_machine()}))  # tuples as lists, as in the file
-    try:
-        run_dir.mkdir(parents=True, exist_ok=True)
+    def __init__(self, args: Args):
+        name = f"runs/{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}"
+        self.args, self.dir = args, Path(args.run_dir or name).expanduser()
+        self.machine, self.clock, self.compiled = describe_machine(), time.time(), False
+        self.last_return = self.last_evaluation = "-"  # shown by the progress bar
+        self.stack = ExitStack()  # all that is to be closed, however the run ends
+        self.training: Training | None = None
         try:
-            fcntl.flock(os.open(run_dir, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
-        except BlockingIOError:
-            refuse(f"another process is at work in {run_dir}")
-        except OSError:  # this file system has no locks
-            pass
-        if any(run_dir.iterdir()) and not args.resume:
-            refuse(f"the run folder {run_dir} is not empty; name another --run-dir, or continue its run with --resume")
-        begun = (run_dir / "config.json").exists()
-        if not begun:
-            if any((run_dir / name).exists() for name in ("best.pt", "last.pt", "evaluations.csv", "result.json")):
-                refuse(f"the run in {run_dir} has lost its config.json, so that it cannot be continued")
-            write_atomically(run_dir / "config.json", json.dumps(config, indent=2).encode())
-        old = json.loads((run_dir / "config.json").read_text())
-        changed = changed_flags(config["args"], old["args"])
-        if old.keys() != config.keys():
-            raise KeyError
-    except OSError as error:
-        refuse(f"cannot write to the run folder {run_dir}: {error.strerror}")
-    except (ValueError, KeyError, TypeError):
-        refuse(f"{run_dir / 'config.json'} is damaged or not of this {SCRIPT}")
-    if changed:
-        was = ", ".join(f"--{name.replace('_', '-')} {old['args'][name]}" for name in changed)
-        refuse(f"the run in {run_dir} was started with other flags than these: {was}")
-    if (run_dir / "result.json").exists():
-        print(f"the run in {run_dir} is finished")
-        raise SystemExit(0)
-    if not begun:
-        return run_dir, None
-    saved = None
-    if (run_dir / "last.pt").exists():
-        if old["versions"] != config["versions"]:
-            refuse(f"the run in {run_dir} can be continued exactly with its own versions only: {old['versions']}")
-        if old["cpu"] != config["cpu"]:
-            print(f"warning: begun on {old['cpu']}; on {config['cpu']} the last bits of its numbers may differ")
-        if old["git_commit"] != config["git_commit"]:
-            print(f"warning: begun with the code of commit {old['git_commit']}, which is another one now")
-        saved = load_checkpoint(run_dir / "last.pt")
-        if changed_flags(saved["args"], asdict(args)) or not saved.keys() >= RESUMED:
-            refuse(f"{run_dir / 'last.pt'} is no checkpoint to continue the run in {run_dir} from")
-    for leftover in (*run_dir.glob("*.pt.tmp"), *run_dir.glob("*.json.tmp"), run_dir / "failure.json"):
-        leftover.unlink(missing_ok=True)  # of a process that was killed or failed
-    if saved is None:
-        for leftover in run_dir.glob("events.out.tfevents.*"):
-            leftover.unlink()
-        write_atomically(run_dir / "config.json", json.dumps(config, indent=2).encode())
-    return run_dir, saved
+            self.dir.mkdir(parents=True, exist_ok=True)
+            self.lock()
+            begun = [path for path in self.dir.iterdir() if path.name != ".lock"]
+        except OSError as error:
+            refuse(f"cannot write to the run folder {self.dir}: {error.strerror}")
+        if begun and not args.resume:
+            refuse(f"the run folder {self.dir} is not empty; name another --run-dir, or continue its run with --resume")
+        self.checkpoint = self.find_checkpoint()
 
+    def lock(self):
+        """Refuse a folder in which another process is at work; the lock ends with its process, even one killed."""
+        lock = filelock.FileLock(self.dir / ".lock")
+        try:
+            lock.acquire(blocking=False)
+        except filelock.Timeout:
+            refuse(f"another process is at work in {self.dir}")
+        except NotImplementedError:  # this file system has no locks
+            return
+        self.stack.callback(lock.release)
 
-def fail_numerically(run_dir: Path, **facts):
-    """End the run where a number is not finite: say which, where and when; the last checkpoint is left as it is."""
-    facts["mujoco_warnings"] = mujoco_warnings[:5]
-    print(f"{SCRIPT}: numerical failure: {facts} (also in {run_dir / 'failure.json'})", file=sys.stderr)
-    write_atomically(run_dir / "failure.json", json.dumps(facts, indent=2).encode())
-    raise SystemExit(EXIT_FAILURE)
+    def find_checkpoint(self) -> dict | None:
+        """last.pt, if the run can go on from there; exits if it is finished, refuses if it is another one's."""
+        last, finished = self.dir / "last.pt", (self.dir / "result.json").exists()
+        kept = [last] if last.exists() else [] if finished else sorted(self.dir.glob("*.pt"))[:1]
+        for path in kept:
+            saved, now = load_checkpoint(path), asdict(self.args)
+            changed = [name for name in now if name not in FREE_ON_RESUME and now[name] != saved["args"][name]]
+            if changed:
+                was = ", ".join(f"--{name.replace('_', '-')} {saved['args'][name]}" for name in changed)
+                refuse(f"the run in {self.dir} was started with other flags than these: {was}")
+        if finished:
+            say(f"the run in {self.dir} is finished")
+            raise SystemExit(0)
+        for leftover in (*self.dir.glob("*.pt.tmp"), *self.dir.glob("*.json.tmp"), self.dir / "failure.json"):
+            leftover.unlink(missing_ok=True)  # of a process that was killed or failed
+        if kept != [last]:
+            for leftover in self.dir.glob("events.out.tfevents.*"):
+                leftover.unlink()
+            config = json.dumps({"args": asdict(self.args), **self.machine}, indent=2)
+            write_atomically(self.dir / "config.json", config.encode())  # for people: nothing here reads it
+            return None
+        if not saved.keys() >= RESUMED:
+            refuse(f"{last} is no checkpoint to continue from")
+        begun = saved["machine"]
+        if begun["versions"] != self.machine["versions"]:
+            refuse(f"the run in {self.dir} can be continued exactly with its own versions only: {begun['versions']}")
+        if begun["cpu"] != self.machine["cpu"]:
+            say(f"warning: begun on {begun['cpu']}; on {self.machine['cpu']} the last bits of its numbers may differ")
+        if begun["git_commit"] != self.machine["git_commit"]:
+            say(f"warning: begun with the code of commit {begun['git_commit']}, which is another one now")
+        return saved
 
+    def __enter__(self):
+        return self
 
-def check_rollout(run_dir: Path, roll: Rollout, step: int):
-    """Fail at the first reward or observation that is not finite."""
-    bad = ~np.isfinite(roll.rewards) | ~np.isfinite(roll.next_obs).all(-1)
-    for at, obs in roll.first_obs.items():
-        bad[at] |= not np.isfinite(obs).all()
-    if bad.any():
-        t, i = np.argwhere(bad)[0].tolist()
-        values = {"reward": roll.rewards[t, i], "action": roll.actions[t, i], "next_obs": roll.next_obs[t, i]}
-        values |= {"first_obs": roll.first_obs[t, i]} if (t, i) in roll.first_obs else {}
-        values = {name: str(value.tolist()) for name, value in values.items()}  # JSON has no NaN
-        step += (t + 1) * bad.shape[1]
-        fail_numerically(run_dir, what="a reward or an observation", global_step=step, env=i, **values)
+    def __exit__(self, kind, error, trace):
+        """Close everything; where a number was not finite, say which, where and when, and leave what was saved."""
+        self.stack.close()
+        if isinstance(error, NotFinite):
+            facts = error.facts | {"global_step": self.training.progress.global_step if self.training else 0}
+            facts["mujoco_warnings"] = mujoco_warnings[:5]
+            write_atomically(self.dir / "failure.json", json.dumps(facts, indent=2).encode())
+            failure = self.dir / "failure.json"
+            print(f"{SCRIPT}: numerical failure: {facts} (also in {failure})", file=sys.stderr)
+            raise SystemExit(EXIT_FAILURE)
 
+    def begin_or_resume(self) -> Training:
+        """The training, as it was when last.pt was saved; and its logs, where what followed it is dropped."""
+        args, saved = self.args, self.checkpoint
+        training = self.training = Training(args)
+        if saved:
+            training.load(saved)
+        progress = training.progress
+        self.write_evaluations(progress)
+        if args.track:
+            self.track(progress)
+        self.writer = SummaryWriter(self.dir, purge_step=progress.global_step + 1 if saved else None)
+        self.stack.callback(self.writer.close)
+        if not saved:
+            self.log_hyperparameters()
+        shown = None if args.progress else True  # None: on a terminal
+        self.bar = tqdm(total=args.last_step, unit=" steps", unit_scale=True, smoothing=0.05, disable=shown)
+        self.bar.update(progress.global_step)
+        self.stack.callback(self.bar.close)
+        return training
 
-def check_evaluation(run_dir: Path, returns: np.ndarray, step: int):
-    """Fail if an episode's return is not finite."""
-    if not np.isfinite(returns).all():
-        fail_numerically(run_dir, what="an evaluation return", global_step=step, returns=str(returns.tolist()))
+    def track(self, progress: Progress):
+        """Weights & Biases shows what TensorBoard is given; a resumed run goes on in the same place."""
+        import wandb  # an optional extra
 
+        progress.wandb_id = progress.wandb_id or wandb.util.generate_id()
+        wandb.init(
+            project=self.args.wandb_project_name,
+            entity=self.args.wandb_entity,
+            id=progress.wandb_id,
+            name=self.dir.name,
+            resume="allow",
+            config=asdict(self.args),
+            sync_tensorboard=True,
+        )
 
-# --- Main -------------------------------------------------------------------------------------------------------------
+    def log_hyperparameters(self):
+        """The flags, as text and in the HParams tab, and which charts stand together under Custom Scalars."""
+        flags = asdict(self.args)
+        table = "".join(f"|{name}|{value}|\n" for name, value in flags.items())
+        self.writer.add_text("hyperparameters", f"|flag|value|\n|-|-|\n{table}")
+        plain = {k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in flags.items()}
+        for summary in hparams(plain, {"final/best_mean": 0, "final/last_mean": 0}):
+            self.writer.file_writer.add_summary(summary)  # add_hparams would make a subfolder
+        charts = {"return": ["Multiline", ["eval/return_mean", "charts/episodic_return"]]}
+        self.writer.add_custom_scalars({"RefinePPO": charts})
 
+    def compile(self, training: Training):
+        """`update`, compiled if that is wanted and possible, and if the run was begun so."""
+        begun = self.checkpoint["compiled"] if self.checkpoint else None
+        compiled = compile_update(training) if self.args.compile and begun is not False else None
+        self.compiled = compiled is not None
+        self.exit_if_stopped()
+        if begun and not self.compiled:
+            refuse(f"the run in {self.dir} was compiled, and continues exactly only so")
+        gc.freeze()  # the garbage collector need not look through all of torch again and again
+        return compiled or update
 
-def main():
-    args = tyro.cli(Args, description=__doc__)
-    if args.evaluate is not None:
-        return evaluate_checkpoint(Path(args.evaluate), args)
-    clock, signals = time.time(), []
+    def log(self, training: Training, scalars: dict[str, float], episodes: list[tuple[int, float, int]]):
+        """An iteration's numbers, and its episodes' (step, return, length)."""
+        progress = training.progress
+        for step, episode_return, length in episodes:
+            self.writer.add_scalar("charts/episodic_return", episode_return, step)
+            self.writer.add_scalar("charts/episodic_length", length, step)
+            self.last_return = f"{episode_return:.1f}"
+            if step > 0.9 * self.args.total_timesteps:
+                progress.late_returns.append(episode_return)
+        for name, value in scalars.items():
+            self.writer.add_scalar(name, value, progress.global_step)
+        self.writer.add_scalar("charts/mujoco_warnings", len(mujoco_warnings), progress.global_step)
+        mujoco_warnings.clear()
+        self.bar.set_postfix_str(f"return {self.last_return}, evaluation {self.last_evaluation}", refresh=False)
+        self.bar.update(self.args.batch_size)
 
-    def request_stop(signum, _):
-        signals.append(signum)
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a second Ctrl-C stops at once
-        os.write(2, b"\nstopping after this iteration ...\n")  # print() may be in the middle of a line
+    def evaluate_if_due(self, training: Training):
+        """At the first rollout's end at or after each multiple of --eval-interval, and at the end of training.
 
-    def exit_if_stopped():
-        if signals:
-            missing = ([] if args.run_dir else ["--run-dir", str(run_dir)]) + ([] if args.resume else ["--resume"])
-            print(f"\nstopped by {signal.Signals(signals[0]).name}; continue with\n"
-                  f"    {shlex.join([sys.executable, *sys.argv, *missing])}")  # fmt: skip
+        One that a signal ends leaves no trace, and is made when the run is continued.
+        """
+        args, progress, step = self.args, training.progress, training.progress.global_step
+        due = passed(args.eval_interval, max(step - args.batch_size, 0), step) or step == args.last_step
+        if not due or (progress.evaluations and progress.evaluations[-1][0] == step):
+            return
+        returns, lengths = evaluate(training.agent, evaluation_seeds(args, step))
+        if stop_signals:
+            return
+        mean, std = mean_and_std(returns)
+        progress.evaluations.append((step, mean, std, *map(float, (returns.min(), returns.max(), lengths.mean()))))
+        self.write_evaluations(progress)
+        for name, value in (("return_mean", mean), ("return_std", std), ("episode_length", lengths.mean())):
+            self.writer.add_scalar(f"eval/{name}", value, step)
+        if mean > progress.best_return:
+            progress.best_return = mean
+            self.save("best.pt", training, selection_return=mean)
+        self.last_evaluation = f"{mean:.1f}"
+        if args.progress:
+            rate = f"best {progress.best_return:.1f}, {step / progress.train_seconds:.0f} steps/s"
+            say(f"step {step:,}: evaluation return {mean:.1f} +- {std:.1f}, {rate}")
+
+    def write_evaluations(self, progress: Progress):
+        rows = [("global_step", "return_mean", "return_std", "return_min", "return_max", "length_mean")]
+        rows += progress.evaluations
+        write_atomically(self.dir / "evaluations.csv", "".join(",".join(map(str, row)) + "\n" for row in rows).encode())
+
+    def save(self, name: str, training: Training, **more):
+        """A checkpoint that acts: the agent, the flags and the step; `more` goes with it."""
+        policy = {"args": asdict(self.args), "global_step": training.progress.global_step, **training.agent.state()}
+        save_checkpoint(self.dir / name, policy | more)
+
+    def save_last(self, training: Training):
+        """The checkpoint that continues the run."""
+        self.writer.flush()
+        now = time.time()
+        training.progress.wall_seconds += now - self.clock
+        self.clock = now
+        self.save("last.pt", training, **training.state(), compiled=self.compiled, machine=self.machine)
+
+    def exit_if_stopped(self):
+        """Exit if a signal has asked for it, and say how to go on."""
+        if stop_signals:
+            missing = ([] if self.args.run_dir else ["--run-dir", str(self.dir)]) + (
+                [] if self.args.resume else ["--resume"]
+            )
+            say(f"\nstopped by {signal.Signals(stop_signals[0]).name}; continue with")
+            say(f"    {shlex.join([sys.executable, *sys.argv, *missing])}")
             raise SystemExit(EXIT_STOPPED)
 
-    for signum in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1):
-        signal.signal(signum, request_stop)
-    obs_space, action_space = check_args(args)
-    limit_threads(args)
-    run_dir, saved = open_run(args)
-    if args.cuda:  # on the CPU all that is used here is deterministic
-        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # without it cuBLAS refuses to be
-        torch.use_deterministic_algorithms(args.torch_deterministic)
-
-    # All that training changes, and what an earlier process has saved of it
-    agent = Agent(obs_space, action_space, args)
-    moments = init_moments(agent.params)
-    envs, rng = Environments(args.env_id, args.num_envs, args.seed), np.random.default_rng(args.seed)
-    progress = {"global_step": 0, "adam_steps": 0, "best_return": -math.inf, "evaluations": [], "late_returns": [],
-                "train_seconds": 0.0, "wall_seconds": 0.0}  # fmt: skip
-    if saved:
-        with refusing_damage(run_dir / "last.pt"):
+    def finish(self, training: Training):
+        """The final evaluation of the best and the last policy; then result.json, the sign that the run is complete."""
+        args, agent, progress, final = self.args, training.agent, training.progress, {}
+        for name in ("best", "last"):
+            saved = load_checkpoint(self.dir / f"{name}.pt")
             agent.load(saved)
-            copy_into(moments, saved["moments"])
-            envs.load(saved["envs"])
-            rng.bit_generator.state = saved["rng"]
-            progress = {name: saved["progress"][name] for name in progress}
-    obs = agent.normalizer.normalize(envs.obs) if saved else agent.normalizer.observe(envs.obs)
-    step, last_step = progress["global_step"], args.num_iterations * args.batch_size
-
-    def checkpoint(name: str, **more):
-        save_checkpoint(run_dir / name, {"args": asdict(args), "global_step": step, **agent.tensors(), **more})
-
-    def write_evaluations():
-        rows = ["global_step,return_mean,return_std,return_min,return_max,length_mean", *progress["evaluations"]]
-        write_atomically(run_dir / "evaluations.csv", "".join(f"{row}\n" for row in rows).encode())
-
-    # Logs; a resumed run drops what followed its checkpoint, since it will log that again
-    write_evaluations()
-    if args.track:
-        import_module("wandb").init(project=args.wandb_project_name, entity=args.wandb_entity, name=run_dir.name,
-                                    dir=run_dir, config=asdict(args), sync_tensorboard=True)  # fmt: skip
-    writer = SummaryWriter(run_dir, purge_step=step + 1 if saved else None)
-    if not saved:
-        table = "".join(f"|{name}|{value}|\n" for name, value in asdict(args).items())
-        writer.add_text("hyperparameters", f"|flag|value|\n|-|-|\n{table}")
-        flags = {k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in asdict(args).items()}
-        for summary in hparams(flags, {"final/best_mean": 0, "final/last_mean": 0}):
-            writer.file_writer.add_summary(summary)  # add_hparams would make a subfolder
-    compiling = args.compile and (not saved or saved["compiled"])
-    update_function, compiled = compile_update(agent, moments) if compiling else (update, False)
-    exit_if_stopped()
-    if compiling and saved and not compiled:
-        refuse(f"the run in {run_dir} was compiled, and continues exactly only so")
-
-    bar = tqdm(total=last_step, initial=step, unit=" steps", unit_scale=True, smoothing=0.05,
-               disable=None if args.progress else True)  # fmt: skip
-    last_return = last_eval = "-"
-    gc.freeze()  # the garbage collector need not look through all of torch again and again
-    while step < last_step:
-        # Rollout
-        start, step_before = time.time(), step
-        mujoco_warnings.clear()
-        roll = collect(agent, envs, obs, args.num_steps, rng)
-        check_rollout(run_dir, roll, step)
-        obs = roll.obs[-1]
-
-        # Update
-        batch, explained_variance = prepare_batch(agent, roll)
-        learning_rate = args.learning_rate * (1 - step / last_step if args.anneal_lr else 1)
-        losses, updates = learn(update_function, agent, moments, batch, rng, learning_rate, progress["adam_steps"])
-        progress["adam_steps"] += updates
-        step = progress["global_step"] = step + args.batch_size
-        scalars = {f"losses/{name}": value for name, value in zip(LOSSES, losses)}
-        tensors = {**agent.params, **agent.normalizer.tensors()}
-        bad = [name for name, x in (scalars | tensors).items() if not torch.as_tensor(x).isfinite().all()]
-        if bad:
-            values = {name: str(value) for name, value in scalars.items()}
-            what = "a loss, the gradient, a parameter or a running statistic"
-            fail_numerically(run_dir, what=what, global_step=step, not_finite=bad, **values)
-
-        # Logs
-        scalars |= {"losses/explained_variance": explained_variance, "charts/learning_rate": learning_rate,
-                    "charts/mujoco_warnings": len(mujoco_warnings)}  # fmt: skip
-        for offset, episode_return, length in roll.episodes:
-            writer.add_scalar("charts/episodic_return", episode_return, step_before + offset)
-            writer.add_scalar("charts/episodic_length", length, step_before + offset)
-            last_return = f"{episode_return:.1f}"
-            if step_before + offset > 0.9 * args.total_timesteps:
-                progress["late_returns"].append(episode_return)
-        progress["train_seconds"] += time.time() - start
-        scalars["charts/SPS"] = step / progress["train_seconds"]
-
-        def due(interval: int | None, step=step, step_before=step_before) -> bool:
-            return interval is not None and step // interval > step_before // interval
-
-        # Evaluation
-        if due(args.eval_interval) or step == last_step:
-            returns, lengths = evaluate(agent, evaluation_seeds(args, step))
-            check_evaluation(run_dir, returns, step)
+            videos = self.dir / "videos" if args.capture_video and name == "best" else None
+            seeds = evaluation_seeds(args, saved["global_step"], final=True)
+            returns, _ = evaluate(agent, seeds, "rgb_array" if videos else None, videos)
+            self.exit_if_stopped()
             mean, std = mean_and_std(returns)
-            scalars |= {"eval/return_mean": mean, "eval/return_std": std, "eval/episode_length": lengths.mean()}
-            row = step, mean, std, returns.min(), returns.max(), lengths.mean()
-            progress["evaluations"].append(",".join(map(str, row)))
-            write_evaluations()
-            if mean > progress["best_return"]:
-                progress["best_return"] = mean
-                checkpoint("best.pt", selection_return=mean)
-            last_eval = f"{mean:.1f}"
-            if args.progress:
-                rate = f"best {progress['best_return']:.1f}, {scalars['charts/SPS']:.0f} steps/s"
-                bar.write(f"step {step:,}: evaluation return {mean:.1f} +- {std:.1f}, {rate}")
-        for name, value in scalars.items():
-            writer.add_scalar(name, value, step)
+            final[name] = {"global_step": saved["global_step"], "returns": returns.tolist(), "mean": mean, "std": std}
+            # one step on: if a kill precedes result.json, the resumed run drops it
+            self.writer.add_scalar(f"final/{name}_mean", mean, progress.global_step + 1)
+        self.writer.flush()
+        final["best"]["selection_return"] = progress.best_return
+        flags = ("env_id", "exp_name", "seed", "total_timesteps", "refinement_depth", "refinement_schedule")
+        result = {name: getattr(args, name, None) for name in flags} | final
+        result["std_ddof"] = 1
+        result["train_return_last10pct"] = float(np.mean(progress.late_returns)) if progress.late_returns else None
+        result["wall_time_s"] = progress.wall_seconds + time.time() - self.clock
+        result["sps"] = progress.global_step / progress.train_seconds
+        write_atomically(self.dir / "result.json", json.dumps(result, indent=2).encode())
+        for name in ("best", "last"):
+            say("{}: return {mean:.1f} +- {std:.1f} at step {global_step:,}".format(name, **final[name]))
+        say(f"the run is in {self.dir}; look at it with: tensorboard --logdir {shlex.quote(str(self.dir))}")
 
-        # Checkpoints
-        if due(args.save_every):
-            checkpoint(f"step_{step}.pt")
-        if due(args.checkpoint_interval) or step == last_step or signals:
-            writer.flush()
-            progress["wall_seconds"], clock = progress["wall_seconds"] + time.time() - clock, time.time()
-            checkpoint("last.pt", moments=moments, envs=envs.state(), rng=rng.bit_generator.state, compiled=compiled,
-                       progress=progress)  # fmt: skip
-            exit_if_stopped()
-        bar.set_postfix_str(f"return {last_return}, evaluation {last_eval}", refresh=False)
-        bar.update(args.batch_size)
-    bar.close()
 
-    # The final evaluation; result.json is written last, since it says that the run is complete
-    final = {}
-    for name in ("best", "last"):
-        saved = load_checkpoint(run_dir / f"{name}.pt")
-        agent.load(saved)
-        videos = run_dir / "videos" if args.capture_video and name == "best" else None
-        seeds = evaluation_seeds(args, saved["global_step"], final=True)
-        returns, _ = evaluate(agent, seeds, "rgb_array" if videos else None, videos)
-        check_evaluation(run_dir, returns, step)
-        mean, std = mean_and_std(returns)
-        final[name] = {"global_step": saved["global_step"], "returns": returns.tolist(), "mean": mean, "std": std}
-        exit_if_stopped()
-    final["best"]["selection_return"] = progress["best_return"]
-    metrics = {f"final/{name}_mean": final[name]["mean"] for name in final}
-    for name, value in metrics.items():
-        writer.add_scalar(name, value, step + 1)  # one on: if a kill precedes result.json, the resume drops it
-    writer.close()
-    late = progress["late_returns"]
-    result = {name: getattr(args, name) for name in ("env_id", "exp_name", "seed", "total_timesteps")}
-    result |= {name: getattr(args, name, None) for name in ("refinement_depth", "refinement_schedule")}  # null for PPO
-    result |= final
-    result |= {
-        "std_ddof": 1,
-        "train_return_last10pct": float(np.mean(late)) if late else None,
-        "wall_time_s": progress["wall_seconds"] + time.time() - clock,
-        "sps": step / progress["train_seconds"],
-    }
-    write_atomically(run_dir / "result.json", json.dumps(result, indent=2).encode())
-    for name in ("best", "last"):
-        print("{}: return {mean:.1f} +- {std:.1f} at step {global_step:,}".format(name, **final[name]))
-    print(f"the run is in {run_dir}; look at it with: tensorboard --logdir {run_dir}")
+# --- Signals ----------------------------------------------------------------------------------------------------------
+
+stop_signals: list[int] = []
+
+
+def catch_signals():
+    """SIGTERM, Ctrl-C, a closed terminal and Slurm's SIGUSR1 ask a run to save and stop; not under nohup."""
+    for name in ("SIGTERM", "SIGINT", "SIGUSR1", "SIGHUP"):
+        if hasattr(signal, name) and (name != "SIGHUP" or signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN):
+            signal.signal(getattr(signal, name), request_stop)
+
+
+def request_stop(signum, _):
+    stop_signals.append(signum)
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # a second Ctrl-C stops at once
+    with suppress(OSError):  # nobody may be left to read it
+        os.write(2, b"\nstopping after this iteration ...\n")  # print() may be in the middle of a line
 
 
 if __name__ == "__main__":
+    for stream in (sys.stdout, sys.stderr):
+        stream.reconfigure(errors="backslashreplace")  # a locale may lack the letters of a path
     try:
         main()
     except OSError as error:

@@ -4,14 +4,7 @@
 #     sweeps/benchmark.sh | sweeps/run_local.sh -j 16
 #     SEEDS="1 2 3" STEPS=1000000 sweeps/benchmark.sh Hopper-v5 Ant-v5
 #
-# One command per run on standard output. SEEDS, STEPS, RUNS_DIR and SETTINGS are explained in common.sh.
+# One command per run on standard output, seed by seed. --help explains SEEDS, STEPS, RUNS_DIR, SETTINGS, FLAGS, DONE.
 
 set -euo pipefail
-source "$(dirname "$0")/common.sh"
-parse_tasks "$all_tasks" "$@"
-for task in $tasks; do
-    for seed in $SEEDS; do
-        job ppo "$task" "$seed"
-        job refineppo "$task" "$seed"
-    done
-done
+exec python "$(dirname "$0")/generate.py" "$0" "$@"

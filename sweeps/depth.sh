@@ -3,15 +3,7 @@
 #
 #     sweeps/depth.sh HalfCheetah-v5 | sweeps/run_local.sh -j 8
 #
-# One command per run on standard output. SEEDS, STEPS, RUNS_DIR and SETTINGS are explained in common.sh.
+# One command per run on standard output, seed by seed. --help explains SEEDS, STEPS, RUNS_DIR, SETTINGS, FLAGS, DONE.
 
 set -euo pipefail
-source "$(dirname "$0")/common.sh"
-parse_tasks "$all_tasks" "$@"
-for task in $tasks; do
-    for seed in $SEEDS; do
-        for depth in 1 2 4 8; do
-            job refineppo "$task" "$seed" "$depth"
-        done
-    done
-done
+exec python "$(dirname "$0")/generate.py" "$0" "$@"

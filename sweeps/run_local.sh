@@ -34,7 +34,7 @@ case $n in '' | *[!0-9]* | 0*) refuse "-j must be a whole number of at least 1, 
 [ "$file" = - ] || exec <"$file"
 
 SWEEP_DIR=$(mktemp -d)
-export SWEEP_DIR
+export SWEEP_DIR SWEEP_JOBS=$n # for jobs.py
 trap 'rm -rf "$SWEEP_DIR"' EXIT
 awk 'NF && $1 !~ /^#/ && !seen[$0]++' >"$SWEEP_DIR/jobs"
 [ -s "$SWEEP_DIR/jobs" ] || refuse "no jobs"
@@ -47,11 +47,11 @@ mkdir "$SWEEP_DIR/running"
 
 # Whoever runs the jobs need not know of a stop: those that run are told to save, and those that follow end at once
 stop() {
-    echo "stopping; every running job saves first ..." >&2
     touch "$SWEEP_DIR/stop"
     for process in "$SWEEP_DIR"/running/*; do
         kill -TERM "${process##*/}" 2>/dev/null || true
     done
+    echo "stopping; every running job saves first ..." >&2 || true # the terminal may be gone
 }
 trap stop INT TERM HUP USR1
 

@@ -12,6 +12,7 @@
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
 RUNS_DIR=${RUNS_DIR:-runs}
+export RUNS_DIR=${RUNS_DIR/#~\//$HOME/} # ~/ is the home folder, as in the generators
 
 refuse() {
     echo "run_slurm.sh: error: $1" >&2

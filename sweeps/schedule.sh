@@ -3,15 +3,7 @@
 #
 #     sweeps/schedule.sh | sweeps/run_slurm.sh --max-running 64 -- --time=4:00:00
 #
-# One command per run on standard output. SEEDS, STEPS, RUNS_DIR and SETTINGS are explained in common.sh.
+# One command per run on standard output, seed by seed. --help explains SEEDS, STEPS, RUNS_DIR, SETTINGS, FLAGS, DONE.
 
 set -euo pipefail
-source "$(dirname "$0")/common.sh"
-parse_tasks "$mujoco" "$@"
-for task in $tasks; do
-    for seed in $SEEDS; do
-        for schedule in average uniform inverse; do
-            job refineppo "$task" "$seed" "" "$schedule"
-        done
-    done
-done
+exec python "$(dirname "$0")/generate.py" "$0" "$@"

@@ -4,20 +4,9 @@
 #
 #     sweeps/toy.sh | sweeps/run_local.sh -j 2
 #
-# One command per run on standard output; STEPS is 50000 here. SEEDS, RUNS_DIR and SETTINGS are explained in common.sh.
+# One command per run on standard output, seed by seed; STEPS is 50000 here, and toy.args the settings. --help explains
+# SEEDS, STEPS, RUNS_DIR, FLAGS, DONE.
 
 set -euo pipefail
-STEPS=${STEPS:-50000}
-source "$(dirname "$0")/common.sh"
-parse_tasks sweeps.toy_env:Coordination-v0 "$@"
-extra=" --num-envs 16 --num-steps 64 --num-minibatches 8 --log-std-init -2"
-extra+=" --eval-interval 1024 --eval-episodes 50"
-[ $# = 0 ] || refuse "the toy is one task; there are no arguments"
-for seed in $SEEDS; do
-    job ppo "$tasks" "$seed"
-    for depth in 1 2 4; do
-        for schedule in uniform average; do
-            job refineppo "$tasks" "$seed" $depth $schedule
-        done
-    done
-done
+export STEPS=${STEPS:-50000}
+exec python "$(dirname "$0")/generate.py" "$0" "$@"

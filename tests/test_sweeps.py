@@ -11,20 +11,26 @@ import signal
 import subprocess
 import sys
 import time
+from functools import cache
 from pathlib import Path
 
 import gymnasium as gym
+import jobs
 import pytest
+import torch
 import tyro
 from conftest import ROOT
-from resume_helpers import differences, outcome
-from test_commands import TASKS
 
 import ppo_continuous
 import refineppo_continuous
 from sweeps.toy_env import phi, psi
 
-MUJOCO = TASKS[:9]
+MUJOCO = "Ant HalfCheetah Hopper Walker2d Swimmer Pusher Reacher HumanoidStandup Humanoid"
+MUJOCO = [f"{name}-v5" for name in MUJOCO.split()]
+TASKS = MUJOCO + "Pendulum-v1 MountainCarContinuous-v0 LunarLanderContinuous-v3 BipedalWalker-v3".split()
+TASKS += ["BipedalWalkerHardcore-v3"]
+GENERATORS = "benchmark.sh depth.sh schedule.sh controls.sh learning_rates.sh toy.sh".split()
+OWN = "SEEDS STEPS RUNS_DIR SETTINGS FLAGS DONE".split()
 TINY = "--no-compile --num-steps 32 --num-minibatches 2 --update-epochs 1 --actor-hidden 16 --critic-hidden 16"
 TINY += " --eval-interval 640 --eval-episodes 1 --final-eval-episodes 1 --checkpoint-interval 32"
 
@@ -32,21 +38,29 @@ TINY += " --eval-interval 640 --eval-episodes 1 --final-eval-episodes 1 --checkp
 def environment(folder: Path, **settings) -> dict:
     """What the shell scripts see: this Python first in PATH, and nothing of the caller's own sweeps."""
     bin_folder = str(Path(sys.executable).parent)
-    clean = {k: v for k, v in os.environ.items() if k not in ("SEEDS", "STEPS", "RUNS_DIR", "SETTINGS")}
+    clean = {name: value for name, value in os.environ.items() if name not in OWN}
     paths = os.pathsep.join([str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
     return clean | {"PATH": f"{folder / 'bin'}:{bin_folder}:{os.environ['PATH']}", "PYTHONPATH": paths} | settings
 
 
 def shell(folder: Path, script: str, *words, stdin: str = "", **settings) -> subprocess.CompletedProcess:
     """sweeps/SCRIPT, with these environment variables."""
-    return subprocess.run([ROOT / "sweeps" / script, *map(str, words)], cwd=folder, input=stdin, text=True,
-                          capture_output=True, timeout=600, env=environment(folder, **settings))  # fmt: skip
+    env = environment(folder, **settings)
+    command = [ROOT / "sweeps" / script, *map(str, words)]
+    return subprocess.run(command, cwd=folder, input=stdin, text=True, capture_output=True, timeout=600, env=env)
 
 
-def generate(folder: Path, script: str, *tasks, **settings) -> list[str]:
+@cache
+def generate(script: str, *tasks, folder: Path = ROOT, **settings) -> list[str]:
     done = shell(folder, script, *tasks, **settings)
     assert (done.returncode, done.stderr) == (0, "")
     return done.stdout.splitlines()
+
+
+def check_refused(done: subprocess.CompletedProcess, *names: str):
+    """Exit 2, and one sentence that names these, before anything was printed."""
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1), done.stderr
+    assert all(name in done.stderr for name in names), done.stderr
 
 
 def parse(line: str):
@@ -57,127 +71,225 @@ def parse(line: str):
     return tyro.cli(module.Args, args=words)
 
 
+def folders(lines: list[str]) -> list[str]:
+    return [Path(parse(line).run_dir).name for line in lines]
+
+
+def method(args) -> tuple:
+    """(script, K, schedule, the actor's layers)."""
+    refinement = getattr(args, "refinement_depth", None), getattr(args, "refinement_schedule", None)
+    return args.exp_name.removesuffix("_continuous"), *refinement, args.actor_hidden
+
+
 # --- Generators -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("script, tasks, per_task", [
-    ("benchmark.sh", TASKS, {("ppo", None, None), ("refineppo", 4, "average")}),
-    ("depth.sh", TASKS, {("refineppo", k, "average") for k in (1, 2, 4, 8)}),
-    ("schedule.sh", MUJOCO, {("refineppo", 4, schedule) for schedule in ("average", "uniform", "inverse")}),
-    ("toy.sh", ["sweeps.toy_env:Coordination-v0"],
-     {("ppo", None, None)} | {("refineppo", k, s) for k in (1, 2, 4) for s in ("uniform", "average")}),
-])  # fmt: skip
-def test_a_sweep_is_complete(script, tasks, per_task, tmp_path):
-    lines = generate(tmp_path, script)
-    assert len(lines) == len(tasks) * len(per_task) * 5 == len(set(lines))
-    runs, folders = set(), set()
-    for line in lines:
-        args = parse(line)
-        refinement = getattr(args, "refinement_depth", None), getattr(args, "refinement_schedule", None)
-        runs.add((args.env_id, args.seed, args.exp_name.removesuffix("_continuous"), *refinement))
-        folders.add(args.run_dir)
-        assert args.resume and args.total_timesteps == (50_000 if script == "toy.sh" else 6_000_000)
-    assert runs == {(task, seed, *run) for task in tasks for seed in range(1, 6) for run in per_task}
-    assert len(folders) == len(lines)
-    assert not any(tmp_path.iterdir())
+def ppo(*layers) -> tuple:
+    return "ppo", None, None, layers or (128, 128)
 
 
-def test_a_run_has_one_command_in_all_sweeps(tmp_path):
-    sweeps = [set(generate(tmp_path, f"{name}.sh")) for name in ("benchmark", "depth", "schedule")]
+def refined(depth: int, schedule: str) -> tuple:
+    return "refineppo", depth, schedule, (128, 128)
+
+
+@pytest.mark.parametrize(
+    "script, tasks, methods, seeds, steps",
+    [
+        ("benchmark.sh", TASKS, {ppo(), refined(4, "average")}, 5, 6_000_000),
+        ("depth.sh", TASKS, {refined(k, "average") for k in (1, 2, 4, 8)}, 5, 6_000_000),
+        ("schedule.sh", MUJOCO, {refined(4, s) for s in ("average", "uniform", "inverse")}, 5, 6_000_000),
+        (
+            "toy.sh",
+            ["sweeps.toy_env:Coordination-v0"],
+            {ppo()} | {refined(k, s) for k in (1, 2, 4) for s in ("uniform", "average")},
+            5,
+            50_000,
+        ),
+        (
+            "controls.sh",
+            ["HalfCheetah-v5", "Pusher-v5", "Hopper-v5", "Swimmer-v5"],  # and HumanoidStandup, see below
+            {refined(k, "average") for k in (1, 2, 8)}
+            | {refined(4, s) for s in ("uniform", "inverse")}
+            | {ppo(128, 128, 128, 128, 128), ppo(256, 256)},
+            5,
+            1_000_000,
+        ),
+    ],
+)
+def test_a_sweep_is_complete(script, tasks, methods, seeds, steps):
+    args = [parse(line) for line in generate(script)]
+    assert len({a.run_dir for a in args}) == len(args)
+    assert all(a.resume and a.total_timesteps == steps for a in args)
+    assert [a.seed for a in args] == sorted(a.seed for a in args)  # all tasks of seed 1 first
+    runs = {(a.env_id, a.seed, method(a)) for a in args if script != "controls.sh" or a.env_id in tasks}
+    assert runs == {(task, seed, m) for task in tasks for seed in range(1, seeds + 1) for m in methods}
+    rest = {(a.env_id, a.seed, method(a)) for a in args} - runs
+    wide = {ppo(216, 216) if m == ppo(256, 256) else m for m in methods}
+    assert not rest or rest == {("HumanoidStandup-v5", seed, m) for seed in range(1, 6) for m in wide}
+    assert len(args) == (175 if script == "controls.sh" else len(runs))
+
+
+def test_learning_rates_are_a_third_and_three_times_the_tasks(tmp_path):
+    (tmp_path / "tuned" / "ppo").mkdir(parents=True)
+    (tmp_path / "tuned" / "ppo" / "Swimmer-v5.args").write_text("--learning-rate 6e-4")
+    args = [parse(line) for line in generate("learning_rates.sh", folder=tmp_path, SETTINGS="tuned")]
+    runs = {(a.env_id, a.seed, method(a), a.learning_rate) for a in args}
+    tasks, methods = (
+        ("HalfCheetah-v5", "Hopper-v5", "Swimmer-v5"),
+        (ppo(), refined(4, "average"), refined(4, "uniform")),
+    )
+    assert len(args) == 54 and {a.total_timesteps for a in args} == {1_000_000}
+    assert runs == {
+        (task, seed, m, rate)
+        for task in tasks
+        for m in methods
+        for seed in (1, 2, 3)
+        for rate in ((2e-4, 1.8e-3) if (task, m) == ("Swimmer-v5", ppo()) else (1e-4, 9e-4))
+    }
+
+
+def test_a_run_has_one_command_in_all_sweeps():
+    sweeps = [set(generate(f"{name}.sh")) for name in ("benchmark", "depth", "schedule")]
     runs = {line: parse(line) for line in set.union(*sweeps)}
     assert len({args.run_dir for args in runs.values()}) == len(runs) == 440  # of 140 + 280 + 135 lines
     shared = {(runs[line].env_id, runs[line].seed) for line in set.intersection(*sweeps)}
     assert shared == {(task, seed) for task in MUJOCO for seed in range(1, 6)}
 
 
+def test_a_folder_says_what_distinguishes_a_run():
+    chosen = {"SEEDS": "1", "SETTINGS": "none"}
+    assert folders(generate("benchmark.sh", "HalfCheetah-v5", **chosen)) == [
+        "HalfCheetah-v5__ppo__6M__1",
+        "HalfCheetah-v5__refineppo-K4-average__6M__1",
+    ]
+    names = {
+        "--actor-hidden 256 256": "256x256__50k",
+        "--actor-hidden=128 128 --gamma=0.99": "50k",  # as the scripts have it
+        "--learning_rate 0.001 --no-anneal-lr": "no-anneal-lr,learning-rate=0.001__50k",
+        "--no-anneal-lr --learning-rate 1e-3": "no-anneal-lr,learning-rate=0.001__50k",
+        "--save-every 5000 --checkpoint-interval 9 --no-progress --track --capture-video": "50k",
+        "--eval-interval 5000 --actor-hidden 8 --critic-hidden 8 8": "8__critic-hidden=8x8,eval-interval=5000__50k",
+    }
+    for flags, name in names.items():
+        (line,) = generate("benchmark.sh", "Maze:Hard/A-v1", STEPS="50000", FLAGS=flags, **chosen)[:1]
+        assert folders([line]) == [f"Maze_Hard_A-v1__ppo__{name}__1"]
+        given = tyro.cli(ppo_continuous.Args, args=shlex.split(flags))
+        parsed = parse(line)
+        others = ("env_id", "seed", "total_timesteps", "run_dir", "resume")
+        assert all(getattr(parsed, name) == value for name, value in vars(given).items() if name not in others)
+    many = "--gamma 0.9 --gae-lambda 0.8 --clip-coef 0.1 --ent-coef 0.125 --vf-coef 0.625 --max-grad-norm 0.875"
+    many += " --num-envs 2 --num-steps 1024 --num-minibatches 16 --update-epochs 5"
+    long = [folders(generate("benchmark.sh", "Hopper-v5", STEPS="4097", FLAGS=f"{many} --log-std-init {x}", **chosen))
+            for x in (-1, -2)]  # fmt: skip
+    assert all(re.fullmatch(r"Hopper-v5__ppo__11-flags-[0-9a-f]{8}__4097__1", name) for name, _ in long)
+    assert len({name for names in long for name in names}) == 4
+
+
 def test_tasks_seeds_steps_and_folders_can_be_chosen(tmp_path):
-    chosen = {"SEEDS": "7 11", "STEPS": "4096", "RUNS_DIR": "my runs"}
-    lines = generate(tmp_path, "benchmark.sh", "Hopper-v5", "Pendulum-v1", **chosen)
-    args = [parse(line) for line in lines]
-    assert [(a.env_id, a.seed) for a in args[::2]] == [(t, s) for t in ("Hopper-v5", "Pendulum-v1") for s in (7, 11)]
+    chosen = {"SEEDS": "7 11", "STEPS": "4096", "HOME": str(tmp_path)}
+    args = [
+        parse(line) for line in generate("benchmark.sh", "Hopper-v5", "Pendulum-v1", RUNS_DIR="~/my runs", **chosen)
+    ]
+    assert [(a.seed, a.env_id) for a in args[::2]] == [(s, t) for s in (7, 11) for t in ("Hopper-v5", "Pendulum-v1")]
     assert {a.total_timesteps for a in args} == {4096}
-    assert {Path(a.run_dir).parent for a in args} == {Path("my runs")}
-
-
-def test_commands_are_short_in_the_repository_and_complete_elsewhere(tmp_path):
-    here, elsewhere = (generate(folder, "depth.sh", "Hopper-v5")[0] for folder in (ROOT, tmp_path))
+    assert {Path(a.run_dir).parent for a in args} == {tmp_path / "my runs"}
+    here, elsewhere = (generate("depth.sh", "Hopper-v5", folder=folder)[0] for folder in (ROOT, tmp_path))
     assert here.startswith("python refineppo_continuous.py ")
     assert elsewhere == here.replace("refineppo_continuous.py", shlex.quote(str(ROOT / "refineppo_continuous.py")), 1)
+    assert not any(tmp_path.iterdir())  # a generator prints and does nothing else
+
+
+def test_runs_that_are_done_are_left_out(tmp_path):
+    lines = generate("benchmark.sh", "Hopper-v5", "Ant-v5")
+    done = [folders(lines)[2], "Maze-v0__ppo__6M__1"]
+    (tmp_path / "runs.csv").write_text("task,run,failure\n" + "".join(f"x,{name},\n" for name in done))
+    for table in (tmp_path / "runs.csv", "~/runs.csv"):
+        left = generate("benchmark.sh", "Hopper-v5", "Ant-v5", DONE=str(table), HOME=str(tmp_path))
+        assert left == lines[:2] + lines[3:]
 
 
 def test_settings_files(tmp_path):
     for algorithm, text in (
-        ("ppo", "--gamma 0.999  # published for this task\n\n--num-envs 4\n--num-steps 512\n"),
+        ("ppo", "--gamma 0.999  # published for this task\n\n--num_envs 4\n--num-steps=512\n"),
         ("refineppo", "# found by the search\n--refinement-depth 2 --refinement-schedule uniform --gamma 0.9\n"),
     ):
         file = tmp_path / "tuned" / algorithm / "Swimmer-v5.args"
         file.parent.mkdir(parents=True)
         file.write_text(text)
         (file.parent / "Hopper-v5.args").write_text("# the defaults do\n")
-    chosen = {"SETTINGS": "tuned", "SEEDS": "1"}
-    ppo, refined, *hopper = generate(tmp_path, "benchmark.sh", "Swimmer-v5", "Hopper-v5", **chosen)
-    assert (parse(ppo).gamma, parse(ppo).num_envs, parse(ppo).num_steps) == (0.999, 4, 512)
-    assert (parse(refined).refinement_depth, parse(refined).refinement_schedule) == (2, "uniform")
-    assert parse(refined).gamma == 0.9
-    defaults = generate(tmp_path, "benchmark.sh", "Swimmer-v5", "Hopper-v5", SETTINGS="none", SEEDS="1")
-    assert hopper == defaults[2:]  # an empty file and none are the same settings, and so the same runs
-    assert not {parse(ppo).run_dir, parse(refined).run_dir} & {parse(line).run_dir for line in defaults}
+    chosen = {"folder": tmp_path, "SETTINGS": "tuned", "SEEDS": "1"}
+    lines = generate("benchmark.sh", "Swimmer-v5", "Hopper-v5", **chosen)
+    ppo, refined = map(parse, lines[:2])
+    assert (ppo.gamma, ppo.num_envs, ppo.num_steps) == (0.999, 4, 512)
+    assert (refined.refinement_depth, refined.refinement_schedule, refined.gamma) == (2, "uniform", 0.9)
+    defaults = generate("benchmark.sh", "Swimmer-v5", "Hopper-v5", folder=tmp_path, SETTINGS="none", SEEDS="1")
+    assert lines[2:] == defaults[2:]  # an empty file and none are the same settings, and so the same runs
+    assert not set(folders(lines[:2])) & set(folders(defaults))
 
-    depths = [parse(line) for line in generate(tmp_path, "depth.sh", "Swimmer-v5", **chosen)]
+    depths = [parse(line) for line in generate("depth.sh", "Swimmer-v5", **chosen)]
     assert [a.refinement_depth for a in depths] == [1, 2, 4, 8]  # a sweep's own choice wins over the settings
     assert {(a.refinement_schedule, a.gamma) for a in depths} == {("uniform", 0.9)}
-    assert refined in generate(tmp_path, "depth.sh", "Swimmer-v5", **chosen)
-    file.write_text("--gamma 0.8")
-    assert parse(generate(tmp_path, "benchmark.sh", "Swimmer-v5", **chosen)[1]).run_dir != parse(refined).run_dir
+    assert lines[1] in generate("depth.sh", "Swimmer-v5", **chosen)
+    over = parse(generate("benchmark.sh", "Swimmer-v5", FLAGS="--gamma 0.5", **chosen)[0])
+    assert (over.gamma, over.num_envs) == (0.5, 4)
 
 
-def test_settings_that_come_with_the_repository_are_understood(tmp_path):
-    lines = generate(tmp_path, "benchmark.sh", SEEDS="1")
-    for line in lines:
-        assert parse(line).env_id in TASKS
-
-
-@pytest.mark.parametrize("text, names", [
-    ("--num-envs=4", "--num-envs=4"),
-    ("--gamma 0.9 --refinement_depth 2", "--refinement_depth"),
-    ("--refinement-schedule uniform\n--refinement-depth # 2", "--refinement-depth"),
-    ("--seed 7", "--seed"),
-    ("--total-timesteps 1000", "--total-timesteps"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "text, names",
+    [
+        ("--gamma 0.9 --no-such-flag 2", "--no-such-flag"),
+        ("--refinement-schedule uniform\n--refinement-depth # 2", "--refinement-depth"),
+        ("--seed 1", "--seed is the sweep's own"),
+        ("--total-timesteps 6000000", "--total-timesteps is the sweep's own"),
+        ("--gamma 'x", "quotation"),
+    ],
+)
 def test_settings_that_would_mislead_are_refused(text, names, tmp_path):
     (tmp_path / "tuned" / "refineppo").mkdir(parents=True)
     (tmp_path / "tuned" / "refineppo" / "Hopper-v5.args").write_text(text)
     done = shell(tmp_path, "benchmark.sh", "Ant-v5", "Hopper-v5", SETTINGS="tuned")
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
-    assert names in done.stderr and "refineppo/Hopper-v5.args" in done.stderr
+    check_refused(done, names, "refineppo/Hopper-v5.args")
 
 
-@pytest.mark.parametrize("words, settings, names", [
-    (["--depth"], {}, "--depth"),
-    ([], {"SEEDS": "1 two"}, "SEEDS"),
-    ([], {"SEEDS": "1,2"}, "SEEDS"),
-    ([], {"SEEDS": " "}, "SEEDS"),
-    ([], {"SEEDS": "1 01"}, "SEEDS"),
-    ([], {"STEPS": "6e6"}, "STEPS"),
-    ([], {"SETTINGS": "no/such"}, "no/such"),
-])  # fmt: skip
-@pytest.mark.parametrize("script", ["benchmark.sh", "depth.sh", "schedule.sh", "toy.sh"])
+@pytest.mark.parametrize(
+    "script, words, settings, names",
+    [
+        *(
+            (script, words, settings, names)
+            for script in ("depth.sh", "toy.sh")
+            for words, settings, names in (
+                (["--depth"], {}, "--depth"),
+                ([], {"SEEDS": "1 two"}, "SEEDS"),
+                ([], {"SEEDS": "1,2"}, "SEEDS"),
+                ([], {"SEEDS": " "}, "SEEDS"),
+                ([], {"SEEDS": "1 01"}, "SEEDS"),
+                ([], {"STEPS": "6e6"}, "STEPS"),
+                ([], {"SETTINGS": "no/such"}, "no/such"),
+                ([], {"DONE": "no/such.csv"}, "no/such.csv"),
+                ([], {"DONE": str(ROOT / "sweeps" / "bounds.csv")}, "no column `run`"),
+            )
+        ),
+        ("depth.sh", ["a task"], {}, "a task"),
+        ("toy.sh", ["Hopper-v5"], {}, "one task"),
+        ("depth.sh", [], {"FLAGS": "--no-such-flag"}, "FLAGS: Unrecognized options: --no-such-flag"),
+        ("depth.sh", [], {"FLAGS": "--refinement-depth 2"}, "FLAGS: --refinement-depth is the sweep's own"),
+        ("benchmark.sh", [], {"FLAGS": "--run-dir x"}, "FLAGS: --run-dir is the sweep's own"),
+    ],
+)
 def test_generators_refuse_in_one_sentence(script, words, settings, names, tmp_path):
-    done = shell(tmp_path, script, *words, **settings)
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
-    assert names in done.stderr
+    check_refused(shell(tmp_path, script, *words, **settings), names, f"{script}: error: ")
 
 
-@pytest.mark.parametrize("script", "benchmark.sh depth.sh schedule.sh toy.sh run_local.sh run_slurm.sh".split())
+@pytest.mark.parametrize("script", [*GENERATORS, "run_local.sh", "run_slurm.sh"])
 def test_help(script, tmp_path):
     done = shell(tmp_path, script, "--help")
     assert done.returncode == 0 and f"sweeps/{script}" in done.stdout and "#" not in done.stdout
+    assert script not in GENERATORS or all(name in done.stdout for name in OWN)
 
 
 def test_shellcheck(tmp_path):
     scripts = [*(ROOT / "sweeps").glob("*.sh"), ROOT / ".ci" / "run", ROOT / ".ci" / "engines.sh"]
-    checked = subprocess.run(["shellcheck", "-x", "-P", "SCRIPTDIR", *scripts], capture_output=True, text=True,
-                             env=environment(tmp_path))  # fmt: skip
+    checked = subprocess.run(["shellcheck", *scripts], capture_output=True, text=True, env=environment(tmp_path))
     assert (checked.returncode, checked.stdout) == (0, "")
 
 
@@ -189,8 +301,8 @@ def test_toy_environment():
     env.reset(seed=3)
     _, reward, *_ = env.step([best[0] + 0.3, best[1] - 0.4])
     assert reward == pytest.approx(-0.25)
-    assert all(env.action_space.contains([phi(x), psi(x, phi(x))]) or max(abs(phi(x)), abs(psi(x, phi(x)))) <= 1
-               for x in (-1, -0.5, 0, 0.5, 1))  # fmt: skip
+    right = [(phi(x), psi(x, phi(x))) for x in (-1, -0.5, 0, 0.5, 1)]
+    assert max(abs(component) for action in right for component in action) <= 1  # within the bounds
 
 
 # --- run_local.sh -----------------------------------------------------------------------------------------------------
@@ -227,13 +339,48 @@ def test_exit_codes_decide(engine, tmp_path):
     assert done.returncode == 1
     attempts = {command: [code] * (1 if code in (0, 2, 3) else 3) for command, code in codes.items()}
     assert joblog(tmp_path) == attempts | {recovers: [1, 0]}
-    assert "2 done, 4 failed, 1 left" in done.stdout
-    failures = re.findall(r"failed \(exit (\d+)\): runs/job-\w+.log\n    says (\d+)", done.stdout)
+    assert "\n2 done, 4 failed, 1 left\n" in done.stdout
+    failures = re.findall(r"^failed \(exit (\d+)\): runs/job-\w+.log\n    says (\d+)", done.stdout, re.M)
     assert sorted(failures) == [("1", "1"), ("137", "137"), ("2", "2"), ("3", "3")]
+    assert re.search(r"failed, \d left.* \| failed after \d s \(exit 3: says 3\): runs/job-\w+.log\n", done.stdout)
+
+
+def training(name: str, steps: int) -> str:
+    folder = f"runs/{name}"
+    return f"mkdir -p {folder}; touch {folder}/result.json; : --total-timesteps {steps} --run-dir {folder}"
+
+
+def test_a_run_is_done_when_its_result_is_there(engine, tmp_path):
+    """A task that ends the program with exit code 0 has failed."""
+    exits = "sh -c 'echo the task says goodbye' x --run-dir=runs/exits --total-timesteps 1000"
+    jobs = "\n".join([training("a", 1000), exits, training("b", 3000)])
+    first, again = (shell(tmp_path, "run_local.sh", "-j", 1, stdin=jobs) for _ in range(2))
+    assert first.returncode == again.returncode == 1
+    for said in (first.stdout, again.stdout):
+        assert "| failed after 0 s (it ended without a result.json: the task says goodbye): runs/exits.log\n" in said
+        assert "\n2 done, 1 failed, 0 left\nfailed (it ended without a result.json): runs/exits.log\n" in said
+    assert re.match(r"1 done, 0 failed, 2 left \(about \d s\) \| done after 0 s: runs/a.log\n", first.stdout)
+    assert again.stdout.startswith("1 done, 0 failed, 2 left | done before: runs/a.log\n")
+
+
+def test_what_is_left_is_told_by_the_steps(tmp_path, monkeypatch):
+    """Two jobs took 2 s for 1000 steps; 6000 steps are left, of which one job has made some, for two workers."""
+    lines = [training(str(i), 1000 * (i + 1)) for i in range(3)]
+    (tmp_path / "running").mkdir()
+    (tmp_path / "jobs").write_text("\n".join([*lines, training("before", 10**6), "sh fails"]))
+    rows = [(lines[0], "done", 2), (training("before", 10**6), "done", 0), ("sh fails", "failed", 50)]
+    ended = [json.dumps(dict(zip(("line", "outcome", "seconds"), row))) for row in rows]
+    (tmp_path / "outcomes").write_text("\n".join(ended))
+    monkeypatch.setenv("SWEEP_JOBS", "2")
+    assert jobs.time_left(tmp_path) == pytest.approx(2 * 5000 / 1000 / 2)
+    (tmp_path / "running" / "1").touch()
+    os.utime(tmp_path / "running" / "1", (time.time() - 4,) * 2)
+    assert jobs.time_left(tmp_path) == pytest.approx((10 - 4) / 2, abs=0.5)
 
 
 def test_each_job_has_one_thread_and_its_own_log(engine, tmp_path):
-    line = "echo $OMP_NUM_THREADS$MKL_NUM_THREADS$OPENBLAS_NUM_THREADS '--run-dir'; : --run-dir 'runs/a b'"
+    line = "echo $OMP_NUM_THREADS$MKL_NUM_THREADS$OPENBLAS_NUM_THREADS '--run-dir'; mkdir 'runs/a b'; "
+    line += "touch 'runs/a b/result.json' && : --run-dir 'runs/a b'"
     assert shell(tmp_path, "run_local.sh", stdin=line, OMP_NUM_THREADS="8").returncode == 0
     assert (tmp_path / "runs" / "a b.log").read_text() == "111 --run-dir\n"
 
@@ -241,11 +388,11 @@ def test_each_job_has_one_thread_and_its_own_log(engine, tmp_path):
 def test_paths_with_blanks(engine, tmp_path):
     """A repository in a folder with a blank, a list with = in its name, and a log that cannot be written."""
     (tmp_path / "my repository").symlink_to(ROOT)
-    (tmp_path / "K=4").write_text("echo fine --run-dir runs/fine/\ntrue --run-dir /dev/null/x\n")
-    done = subprocess.run([tmp_path / "my repository" / "sweeps" / "run_local.sh", "K=4"], cwd=tmp_path, text=True,
-                          capture_output=True, env=environment(tmp_path))  # fmt: skip
+    (tmp_path / "K=4").write_text(f"echo fine; {training('fine', 1)}/\ntrue --run-dir /dev/null/x\n")
+    command = [tmp_path / "my repository" / "sweeps" / "run_local.sh", "K=4"]
+    done = subprocess.run(command, cwd=tmp_path, text=True, capture_output=True, env=environment(tmp_path))
     assert done.returncode == 1 and "1 done, 1 failed, 0 left" in done.stdout and "/dev/null" in done.stderr
-    assert (tmp_path / "runs" / "fine.log").read_text() == "fine --run-dir runs/fine/\n"
+    assert (tmp_path / "runs" / "fine.log").read_text() == "fine\n"
 
 
 def test_a_killed_executor_takes_its_trainings_along(engine, tmp_path):
@@ -272,34 +419,31 @@ def test_dry_run_runs_nothing(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["jobs"]
 
 
-@pytest.mark.parametrize("script, words, stdin, names", [
-    ("run_local.sh", ["-j", "0"], "true", "-j"),
-    ("run_local.sh", ["-j", "many"], "true", "-j"),
-    ("run_local.sh", ["-j"], "true", "-j"),
-    ("run_local.sh", ["--dryrun"], "true", "--dryrun"),
-    ("run_local.sh", ["no_such_file"], "", "no_such_file"),
-    ("run_local.sh", [], "# nothing\n\n", "no jobs"),
-    ("run_slurm.sh", ["--dry-run", "--max-running", "none"], "true", "--max-running"),
-    ("run_slurm.sh", ["--dry-run", "--max-running"], "true", "--max-running"),
-    ("run_slurm.sh", ["--dry-run", "--steps-per-task", "x"], "true", "--steps-per-task"),
-    ("run_slurm.sh", ["--dry-run", "--time=1:00"], "true", "--time"),
-    ("run_slurm.sh", ["--dry-run", "no_such_file"], "", "no_such_file"),
-    ("run_slurm.sh", ["--dry-run"], "", "no jobs"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "script, words, stdin, names",
+    [
+        ("run_local.sh", ["-j", "0"], "true", "-j"),
+        ("run_local.sh", ["-j", "many"], "true", "-j"),
+        ("run_local.sh", ["-j"], "true", "-j"),
+        ("run_local.sh", ["--dryrun"], "true", "--dryrun"),
+        ("run_local.sh", ["no_such_file"], "", "no_such_file"),
+        ("run_local.sh", [], "# nothing\n\n", "no jobs"),
+        ("run_slurm.sh", ["--dry-run", "--max-running", "none"], "true", "--max-running"),
+        ("run_slurm.sh", ["--dry-run", "--max-running"], "true", "--max-running"),
+        ("run_slurm.sh", ["--dry-run", "--steps-per-task", "x"], "true", "--steps-per-task"),
+        ("run_slurm.sh", ["--dry-run", "--time=1:00"], "true", "--time"),
+        ("run_slurm.sh", ["--dry-run", "no_such_file"], "", "no_such_file"),
+        ("run_slurm.sh", ["--dry-run"], "", "no jobs"),
+    ],
+)
 def test_executors_refuse_in_one_sentence(script, words, stdin, names, tmp_path):
-    done = shell(tmp_path, script, *words, stdin=stdin)
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
-    assert names in done.stderr
+    check_refused(shell(tmp_path, script, *words, stdin=stdin), names)
     assert not any(tmp_path.iterdir())
 
 
 def tiny_sweep(folder: Path) -> tuple[list[str], Path]:
     """Ten tiny runs, of which one is longer, and one that always fails; and the longer one's folder."""
-    for algorithm in ("ppo", "refineppo"):
-        file = folder / "tiny" / algorithm / "Pendulum-v1.args"
-        file.parent.mkdir(parents=True)
-        file.write_text(TINY)
-    lines = generate(folder, "benchmark.sh", "Pendulum-v1", SETTINGS="tiny", STEPS="64", RUNS_DIR="runs")
+    lines = generate("benchmark.sh", "Pendulum-v1", folder=folder, SETTINGS="none", FLAGS=TINY, STEPS="64")
     long = lines[0].replace("--total-timesteps 64", "--total-timesteps 24000")
     return [long, *lines[1:], "python no_such_script.py --run-dir runs/broken"], Path(parse(long).run_dir)
 
@@ -327,6 +471,14 @@ def saves(run_dir: Path) -> int:
     return (run_dir / "last.pt").stat().st_mtime_ns if (run_dir / "last.pt").exists() else 0
 
 
+def outcome(run_dir: Path) -> tuple[dict, dict, str]:
+    """A run's last parameters, its result without what a clock measured, and its evaluations."""
+    result = json.loads((run_dir / "result.json").read_text())
+    result = {name: value for name, value in result.items() if name not in ("wall_time_s", "sps")}
+    params = torch.load(run_dir / "last.pt", weights_only=True)["params"]
+    return params, result, (run_dir / "evaluations.csv").read_text()
+
+
 def check_tiny_sweep(folder: Path, lines: list[str], long: Path):
     """Every run is complete, and the interrupted one is what it would have been without."""
     for line in lines[:-1]:
@@ -334,7 +486,10 @@ def check_tiny_sweep(folder: Path, lines: list[str], long: Path):
         assert (result["seed"], result["total_timesteps"]) == (parse(line).seed, parse(line).total_timesteps)
     alone = lines[0].replace("--run-dir runs", "--run-dir alone")
     subprocess.run(shlex.split(alone), cwd=folder, env=environment(folder), check=True, capture_output=True)
-    assert differences(outcome(folder / long), outcome(folder / "alone" / long.name)) == []
+    runs = folder / long, folder / "alone" / long.name
+    (params, result, evaluations), expected = ([*outcome(run)] for run in runs)
+    assert (result, evaluations) == tuple(expected[1:])
+    assert all(torch.equal(params[name], values) for name, values in expected[0].items())
 
 
 def test_a_local_sweep_is_killed_stopped_and_continued(engine, tmp_path):
@@ -358,7 +513,7 @@ def test_a_local_sweep_is_killed_stopped_and_continued(engine, tmp_path):
     assert not training_of(run_dir) and not (run_dir / "result.json").exists()
     assert joblog(tmp_path)[lines[0]] == [137, 75]
 
-    done = shell(tmp_path, *command[0].split("/")[-1:], *command[1:])
+    done = shell(tmp_path, "run_local.sh", *command[1:])
     assert done.returncode == 1 and "10 done, 1 failed, 0 left" in done.stdout
     assert "failed (exit 2): runs/broken.log" in done.stdout and "no_such_script.py" in done.stdout
     assert joblog(tmp_path)[lines[0]] == [137, 75, 0]
@@ -370,8 +525,8 @@ def test_a_local_sweep_is_killed_stopped_and_continued(engine, tmp_path):
 
 def test_slurm_jobs_are_packed_by_their_steps(tmp_path):
     lines = [f"job{i} --total-timesteps {steps}" for i, steps in enumerate((400, 400, 400, 1000, 100, 2000, 100))]
-    done = shell(tmp_path, "run_slurm.sh", "--dry-run", "--max-running", 2, "--steps-per-task", 1000, "-",
-                 "--", "--time=2:00:00", stdin="\n".join([*lines, "job7", lines[0]]))  # fmt: skip
+    words = "--dry-run --max-running 2 --steps-per-task 1000 - -- --time=2:00:00".split()
+    done = shell(tmp_path, "run_slurm.sh", *words, stdin="\n".join([*lines, "job7", lines[0]]))
     submission, *rows = done.stdout.splitlines()
     assert done.returncode == 0 and not any(tmp_path.iterdir())
     assert [tuple(row.split("\t")) for row in rows] == list(zip("11234567", [*lines, "job7"]))
@@ -388,8 +543,7 @@ def test_a_slurm_sweep_is_preempted_requeued_and_finished(tmp_path):
     run_dir = tmp_path / long
 
     def slurm(*words) -> str:
-        return subprocess.run(words, cwd=tmp_path, env=environment(tmp_path), check=True, text=True,
-                              capture_output=True).stdout  # fmt: skip
+        return subprocess.check_output(words, cwd=tmp_path, env=environment(tmp_path), text=True)
 
     def state(task: str, name="JobState") -> str:
         return re.search(rf"{name}=(\w+)", slurm("scontrol", "show", "job", task))[1]
