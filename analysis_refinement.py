@@ -46,6 +46,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from sklearn import linear_model, metrics, model_selection, neural_network, pipeline, preprocessing
 from sklearn.exceptions import ConvergenceWarning
+from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 import refineppo_continuous as refineppo
@@ -761,7 +762,8 @@ def as_png(figure: Figure) -> bytes:
 def main():
     args = tyro.cli(Args, description=__doc__)
     policies = check(args)
-    refineppo.limit_threads(policies[0].args)  # as in the run, for the same returns
+    torch.set_num_threads(policies[0].args.num_threads)  # as in the run, for the same returns
+    threadpool_limits(policies[0].args.num_threads)
     several = len(policies) > 1
     parts = [analyse(policy, args) for policy in tqdm(policies, desc="checkpoints", disable=None if several else True)]
     tables = {name: pd.concat([part[name] for part in parts], ignore_index=True) for name in parts[0]}
