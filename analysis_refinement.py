@@ -433,7 +433,7 @@ def adaptive_rows(policy: Policy, norms: np.ndarray, episodes: int) -> Rows:
         used = []
 
         def mean(obs: np.ndarray) -> np.ndarray:
-            proposals = policy.proposals(obs)
+            proposals = policy.proposals(obs).astype(float)  # as in `norms`
             small = correction_norms(proposals) < tolerance
             used.append(np.where(small.any(0), small.argmax(0) + 1, len(small)))
             return proposals[used[-1], np.arange(len(obs))]
