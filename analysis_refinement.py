@@ -126,13 +126,12 @@ def load_policy(path: Path) -> Policy:
         saved = set()
     if saved == {field.name for field in fields(refineppo.Args)} - {"refinement_depth", "refinement_schedule"}:
         refuse(f"{path} is a checkpoint of PPO, which has no refinement to analyse")
-    agent = refineppo.load_agent(path)
-    if not all(np.isfinite(array).all() for array in agent.arrays().values()):
+    agent, checkpoint = refineppo.load_agent(path), refineppo.load_checkpoint(path)
+    if not all(x.isfinite().all() for part in ("params", "normalizer") for x in checkpoint[part].values()):
         refuse(f"{path} holds parameters that are not finite")
     if agent.args.refinement_depth == 1:
         refuse(f"{path} has refinement depth K = 1: one step, so that there is no refinement to analyse")
-    step = refineppo.load_checkpoint(path)["global_step"]
-    return Policy(path, agent, step, component_names(agent.args.env_id))
+    return Policy(path, agent, checkpoint["global_step"], component_names(agent.args.env_id))
 
 
 def component_names(env_id: str) -> list[str]:
@@ -433,8 +432,8 @@ def adaptive_rows(policy: Policy, norms: np.ndarray, episodes: int) -> Rows:
         used = []
 
         def mean(obs: np.ndarray) -> np.ndarray:
-            proposals = policy.proposals(obs).astype(float)  # as in `norms`
-            small = correction_norms(proposals) < tolerance
+            proposals = policy.proposals(obs)
+            small = correction_norms(proposals.astype(float)) < tolerance  # as precise as `norms`
             used.append(np.where(small.any(0), small.argmax(0) + 1, len(small)))
             return proposals[used[-1], np.arange(len(obs))]
 
@@ -693,8 +692,10 @@ class Figures:
         label = f"steps $k$ (dotted: $K$; past it {PAST_K[self.schedule]})"
         what = f"Return of the policy stopped after $k$ steps (mean and standard error, {self.episodes} episodes)"
         figure, axes = self.lines(what, panels, 2, 2.6, 2.1, xlabel=label)
+        low, high = zip(*(axis.get_ylim() for axis in axes))
         for axis in axes:
             axis.axvline(self.depth, color="0.5", linestyle=":")
+            axis.set_ylim(min(low), max(high))
         return {"anytime": figure}
 
     def adaptive(self) -> dict[str, Figure]:

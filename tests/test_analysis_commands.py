@@ -73,6 +73,15 @@ def header(path: Path) -> str:
     return path.read_text().splitlines()[0]
 
 
+def written(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def files(*tables: str) -> set[str]:
+    """What a command writes of these tables: each its CSV and its figure, if it has one of its own."""
+    return {f"{name}.csv" for name in tables} | {f"{name}.png" for name in FIGURES & set(tables)} | {"summary.json"}
+
+
 def assert_shows_something(path: Path):
     """The picture opens, and neither is of one colour nor a dot on an empty page."""
     pixels = matplotlib.image.imread(path)[..., :3]
@@ -84,15 +93,7 @@ def assert_shows_something(path: Path):
 def test_the_papers_two_analyses_are_the_default(tmp_path, analyse, capsys):
     analyse("--checkpoint", save(tmp_path / "best.pt"), "--num-states", 40)
     out = tmp_path / "analysis"
-    assert sorted(path.name for path in out.iterdir()) == [
-        "delta_r2.csv",
-        "delta_r2.png",
-        "delta_r2_checks.csv",
-        "delta_r2_checks.png",
-        "settling_error.csv",
-        "settling_error.png",
-        "summary.json",
-    ]
+    assert written(out) == files("settling_error", "delta_r2", "delta_r2_checks")
     for name in ("settling_error", "delta_r2", "delta_r2_checks"):
         assert header(out / f"{name}.csv") == COLUMNS[name]
         assert_shows_something(out / f"{name}.png")
@@ -155,9 +156,7 @@ def test_every_section_of_seventeen_actions(tmp_path, analyse, capsys):
 def test_a_section_alone(section, tmp_path, analyse):
     flags = "--sections", section, "--num-states", 20, "--episodes", 2
     analyse("--checkpoint", save(tmp_path / "best.pt"), *flags)
-    names = FILES.get(section, [section])
-    files = {f"{name}.csv" for name in names} | {f"{name}.png" for name in FIGURES & set(names)} | {"summary.json"}
-    assert {path.name for path in (tmp_path / "analysis").iterdir()} == files
+    assert written(tmp_path / "analysis") == files(*FILES.get(section, [section]))
     assert set(json.loads((tmp_path / "analysis/summary.json").read_text())) == {"flags", "checkpoints", section}
 
 
@@ -211,9 +210,8 @@ def test_a_run_through_training(tmp_path, analyse):
     paths = [save(tmp_path / f"{seed}/step_{step}.pt", seed=seed, step=step) for seed in (1, 2) for step in (100, 200)]
     analyse("--checkpoint", *paths, "--num-states", 20, "--sections", "training", "settling", "feedback")
     out = tmp_path / "1/analysis"
-    names = ("feedback", "settling_error", "training")
-    files = {f"{name}.{kind}" for name in names for kind in ("csv", "png")} | {"summary.json"}
-    assert {path.name for path in out.iterdir()} == files | {"training_by_seed.png", "training_across_seeds.csv"}
+    across = {"training_by_seed.png", "training_across_seeds.csv"}
+    assert written(out) == files("feedback", "settling_error", "training") | across
     for name in ("training", "training_by_seed"):
         assert_shows_something(out / f"{name}.png")
     lost = {r["checkpoint"]: r["lost_mean"] for r in read(out / "feedback.csv") if r["reads"] == "zero"}
@@ -256,11 +254,7 @@ def test_tolerances_that_do_not_exist_are_named(tmp_path, analyse, capsys):
 
 def test_a_one_dimensional_action_has_no_delta_r2(tmp_path, analyse, capsys):
     analyse("--checkpoint", save(tmp_path / "best.pt", "Pendulum-v1"), "--num-states", 20)
-    assert sorted(path.name for path in (tmp_path / "analysis").iterdir()) == [
-        "settling_error.csv",
-        "settling_error.png",
-        "summary.json",
-    ]
+    assert written(tmp_path / "analysis") == files("settling_error")
     assert "no delta R^2" in capsys.readouterr().out
 
 
@@ -279,59 +273,57 @@ def change(path: Path, **parts) -> Path:
     return path
 
 
-def malicious(path: Path) -> Path:
-    torch.save({"args": Malicious()}, path)
-    return path
-
-
 def torn(path: Path) -> Path:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     return path
 
 
-def foreign(path: Path) -> Path:
-    path.write_bytes(pickle.dumps({"args": {}}))
-    return path
+def with_arg(path: Path, **args) -> Path:
+    return change(path, args=torch.load(path, weights_only=True)["args"] | args)
 
 
-def with_param(path: Path, name: str, value: torch.Tensor) -> Path:
-    return change(path, params=torch.load(path, weights_only=True)["params"] | {name: value})
+def with_log_std(path: Path, value: torch.Tensor) -> Path:
+    return change(path, params=torch.load(path, weights_only=True)["params"] | {"log_std": value})
 
 
-def of_missing_task(path: Path) -> Path:
-    return change(path, args=torch.load(path, weights_only=True)["args"] | {"env_id": "no_such_module:Task-v0"})
+def with_nan_statistics(path: Path) -> Path:
+    statistics = torch.load(path, weights_only=True)["normalizer"]
+    statistics["obs.mean"].fill_(float("nan"))
+    return change(path, normalizer=statistics)
 
 
-NAN = torch.full((2,), float("nan"))
-BAD_INPUT = {
-    "missing file": (lambda tmp: [tmp / "best.pt"], "there is no checkpoint"),
-    "folder": (lambda tmp: [tmp], "there is no checkpoint"),
-    "torn": (lambda tmp: [torn(save(tmp / "best.pt"))], "damaged"),
-    "malicious": (lambda tmp: [malicious(tmp / "best.pt")], "damaged"),
-    "foreign": (lambda tmp: [foreign(tmp / "best.pt")], "damaged"),
-    "part missing": (lambda tmp: [change(save(tmp / "best.pt"), params=None)], "damaged"),
-    "other shapes": (lambda tmp: [with_param(save(tmp / "best.pt"), "log_std", torch.zeros(3))], "does not fit"),
-    "nan": (lambda tmp: [with_param(save(tmp / "best.pt"), "log_std", NAN)], "not finite"),
-    "ppo": (lambda tmp: [change(save(tmp / "best.pt"), args=asdict(ppo_continuous.Args()))], "PPO"),
-    "one step": (lambda tmp: [save(tmp / "best.pt", refinement_depth=1)], "K = 1"),
-    "missing package": (lambda tmp: [of_missing_task(save(tmp / "best.pt"))], "no_such_module"),
-    "second one bad": (lambda tmp: [save(tmp / "best.pt"), torn(save(tmp / "last.pt"))], "damaged"),
-    "twice": (lambda tmp: [save(tmp / "best.pt"), tmp / "." / "best.pt"], "twice"),
-    "two tasks": (lambda tmp: [save(tmp / "a.pt"), save(tmp / "b.pt", "Pendulum-v1")], "same task"),
-    "two depths": (lambda tmp: [save(tmp / "a.pt"), save(tmp / "b.pt", refinement_depth=3)], "depth"),
-    "two schedules": (lambda tmp: [save(tmp / "a.pt"), save(tmp / "b.pt", refinement_schedule="uniform")], "schedule"),
-    "no checkpoint": (lambda tmp: [], "at least one"),
-    "no section": (lambda tmp: [save(tmp / "best.pt"), "--sections"], "at least one"),
-    "only r2 of one component": (lambda tmp: [save(tmp / "best.pt", "Pendulum-v1"), "--sections", "r2"], "delta R^2"),
-    "one training step": (lambda tmp: [save(tmp / "best.pt"), "--sections", "training"], "two or more"),
-    "seeds for training": (
-        lambda tmp: [save(tmp / "a.pt"), save(tmp / "b.pt", seed=2, step=4), "--sections", "training"],
-        "two or more",
-    ),
-    "fewer states than folds": (lambda tmp: [save(tmp / "best.pt"), "--num-states", 4], "at least 10"),
-    "one state in a fold": (lambda tmp: [save(tmp / "best.pt"), "--num-states", 9], "at least 10"),
-    "one episode": (lambda tmp: [save(tmp / "best.pt"), "--episodes", 1], "--episodes"),
-    "negative seed": (lambda tmp: [save(tmp / "best.pt"), "--seed", -1], "--seed"),
+def other(path: Path, env_id="Reacher-v5", **flags) -> list[Path]:
+    """The checkpoint and a second one."""
+    return [path, save(path.with_name("other.pt"), env_id, **flags)]
+
+
+BAD_INPUT = {  # what is done with a checkpoint -> what the refusal says
+    "missing file": (lambda path: [path.with_name("no.pt")], "there is no checkpoint"),
+    "folder": (lambda path: [path.parent], "there is no checkpoint"),
+    "torn": (lambda path: [torn(path)], "damaged"),
+    "malicious": (lambda path: [torch.save({"args": Malicious()}, path) or path], "damaged"),
+    "foreign": (lambda path: [path.write_bytes(pickle.dumps({"args": {}})) and path], "damaged"),
+    "part missing": (lambda path: [change(path, params=None)], "damaged"),
+    "other shapes": (lambda path: [with_log_std(path, torch.zeros(3))], "does not fit"),
+    "nan": (lambda path: [with_log_std(path, torch.full((2,), float("nan")))], "not finite"),
+    "nan in the statistics": (lambda path: [with_nan_statistics(path)], "not finite"),
+    "ppo": (lambda path: [change(path, args=asdict(ppo_continuous.Args()))], "PPO"),
+    "one step": (lambda path: [save(path, refinement_depth=1)], "K = 1"),
+    "missing package": (lambda path: [with_arg(path, env_id="no_such_module:Task-v0")], "no_such_module"),
+    "second one bad": (lambda path: [path, torn(save(path.with_name("last.pt")))], "damaged"),
+    "twice": (lambda path: [path, path.parent / "." / path.name], "twice"),
+    "two tasks": (lambda path: other(path, "Pendulum-v1"), "same task"),
+    "two depths": (lambda path: other(path, refinement_depth=3), "depth"),
+    "two schedules": (lambda path: other(path, refinement_schedule="uniform"), "schedule"),
+    "no checkpoint": (lambda path: [], "at least one"),
+    "no section": (lambda path: [path, "--sections"], "at least one"),
+    "only r2 of one component": (lambda path: [save(path, "Pendulum-v1"), "--sections", "r2"], "delta R^2"),
+    "one training step": (lambda path: [path, "--sections", "training"], "two or more"),
+    "seeds for training": (lambda path: [*other(path, seed=2, step=4), "--sections", "training"], "two or more"),
+    "fewer states than folds": (lambda path: [path, "--num-states", 4], "at least 10"),
+    "one state in a fold": (lambda path: [path, "--num-states", 9], "at least 10"),
+    "one episode": (lambda path: [path, "--episodes", 1], "--episodes"),
+    "negative seed": (lambda path: [path, "--seed", -1], "--seed"),
 }
 
 
@@ -340,8 +332,7 @@ def test_bad_input_is_refused(case, tmp_path, analyse, capsys, monkeypatch):
     """One sentence, exit 2, no output folder, and nothing in the file is executed."""
     monkeypatch.chdir(tmp_path)
     make_flags, expected = BAD_INPUT[case]
-    (tmp_path / "in").mkdir()
-    flags = make_flags(tmp_path / "in")
+    flags = make_flags(save(tmp_path / "in/best.pt"))
     capsys.readouterr()
     with pytest.raises(SystemExit) as exit:
         analyse("--out-dir", tmp_path / "out", "--checkpoint", *flags)
