@@ -548,9 +548,10 @@ def as_summary(rows: pd.DataFrame, section: str, keys: list[str]) -> dict | Rows
 
 # --- Figures ----------------------------------------------------------------------------------------------------------
 
-AROUND_ONE = ("correction_ratio", "largest_singular_value", "spectral_radius", "spread_of_random_starts")
+AROUND_ONE = ("correction ratio", "largest singular value", "spectral radius", "spread of random starts")
 PAST_K = {"uniform": "$c_k = 1$", "average": "$c_k = 1/K$", "inverse": "$c_k = 1/k$"}
 STYLE = {"font.size": 7, "axes.titlesize": 7, "figure.titlesize": 7.5, "axes.formatter.useoffset": False}
+STYLE["axes.formatter.limits"] = (-4, 5)  # long numbers in powers of ten
 MARKERS = "os^Dv<>P*X"
 BY_SEED = {
     "return_lost_reading_zero": "return lost if $f$ reads zero",
@@ -713,7 +714,8 @@ class Figures:
 
     def dynamics(self) -> dict[str, Figure]:
         columns = {"step": "x", "value": "y", "q10": "low", "q90": "high"}
-        panels = dict(list(self.tables["dynamics"].rename(columns=columns).groupby("quantity", sort=False)))
+        rows = self.tables["dynamics"].rename(columns=columns)
+        panels = dict(list(rows.groupby(rows["quantity"].str.replace("_", " "), sort=False)))
         panels = {name: x.drop(columns=["low", "high"]) if "outside" in name else x for name, x in panels.items()}
         what, limits = "Dynamics of the refinement (median and 10 to 90 % of states)", (-0.3, self.depth + 0.3)
         figure, axes = self.lines(what, panels, 4, 1.65, 1.5, xlabel="step $k$", xlim=limits)
@@ -730,7 +732,8 @@ class Figures:
         table, what = self.tables["training"], "Refinement through training"
         average = across_seeds(table.drop(columns="line"), KEYS["training"]["training"]).sort_values("global_step")
         average["line"] = "$k = " + average["step"].astype(str) + "$"
-        panels = dict(list(mean_with_bars(average, "global_step", "value").groupby("quantity", sort=False)))
+        average = mean_with_bars(average, "global_step", "value")
+        panels = dict(list(average.groupby(average["quantity"].str.replace("_", " "), sort=False)))
         by_step, _ = self.lines(f"{what} (mean and std over seeds)", panels, 3, 2.0, 1.4, xlabel="training step")
 
         files = {policy.path.with_name("evaluations.csv"): policy.args.seed for policy in self.policies}
@@ -750,7 +753,7 @@ def as_png(figure: Figure) -> bytes:
     lines = [axis.get_legend_handles_labels() for axis in figure.axes]
     legend = {label: handle for handles, labels in lines for handle, label in zip(handles, labels)}
     if len(legend) > 1:
-        columns = int(figure.get_figwidth() / 1.3)
+        columns = max(1, int(figure.get_figwidth() / (0.6 + 0.05 * max(map(len, legend)))))
         figure.legend(legend.values(), legend, loc="outside lower center", ncols=columns, frameon=False)
     image = io.BytesIO()
     figure.savefig(image, format="png")

@@ -633,4 +633,4 @@ def test_training_draws_a_line_per_seed_beside_the_learning_curve(tmp_path):
         titles["delta_r2"]: {seed: [[100, 50.25], [200, 100.25]] for seed in ("seed 1", "seed 2")},
         titles["return_lost_reading_zero"]: {"seed 1": [[100, -1], [200, -1]], "seed 2": [[100, -2], [200, -2]]},
     }
-    assert {axis.get_title() for axis in drawn["training"].axes} == set(titles)
+    assert {axis.get_title() for axis in drawn["training"].axes} == {name.replace("_", " ") for name in titles}
