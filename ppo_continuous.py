@@ -705,7 +705,7 @@ def evaluate_checkpoint(given: Args):
     """--evaluate: print a saved policy's returns, which for best.pt and last.pt are those in result.json."""
     path = Path(given.evaluate).expanduser()
     checkpoint = load_checkpoint(path)
-    own = ("evaluate", "final_eval_episodes", "render", "capture_video", "num_threads", "cuda")
+    own = ("evaluate", "final_eval_episodes", "render", "capture_video", "track", "num_threads", "cuda")
     args = replace(Args(**checkpoint["args"]), **{name: getattr(given, name) for name in own})
     check_args(args)
     videos = path.with_suffix(".videos") if args.capture_video else None
