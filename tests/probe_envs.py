@@ -4,7 +4,6 @@ Learning; the observation is uniform in [-1, 1], the actions are bounded by +-1:
     ConstantReward-v0   one step, reward 1: the value must become 1
     MatchAction-v0      one step: act as the observation says, a* = -s
     TwoStepCredit-v0    two steps: the first action decides the reward of the second step
-    Coordination-v0     one step: the paper's task, a1* = phi(s), a2* = psi(s, a1*)
 The reward is minus the squared distance from the right action.
 
 Bookkeeping; the observation is the number of steps in the episode, the reward of step n is the integer n,
@@ -79,25 +78,6 @@ class TwoStepCredit(Probe):
             return np.zeros(2, np.float32), self.delayed, True, False, {}
         self.delayed = -float((action[0] + self.obs[0]) ** 2)
         return np.array([0, 1], np.float32), 0.0, False, False, {}
-
-
-def phi(s):
-    return np.sin(2 * s)
-
-
-def psi(s, a1):
-    return 2 * s * a1 - 1
-
-
-class Coordination(Probe):
-    """Section "Why Iterative Action Refinement Can Work" of the paper."""
-
-    action_space = Box(-1, 1, (2,))
-
-    def step(self, action):
-        s = self.obs[0]
-        reward = -float((action[0] - phi(s)) ** 2 + (action[1] - psi(s, phi(s))) ** 2)
-        return self.observe(), reward, True, False, {}
 
 
 class Counter(Probe):
@@ -183,7 +163,7 @@ class ImageObs(Probe):
         return self.np_random.integers(0, 256, (8, 8, 3), np.uint8)
 
 
-for env in (ConstantReward, MatchAction, TwoStepCredit, Coordination, Terminator):
+for env in (ConstantReward, MatchAction, TwoStepCredit, Terminator):
     gym.register(f"{env.__name__}-v0", env)
 gym.register("Counter-v0", Counter, max_episode_steps=7)
 gym.register("Discrete-v0", DiscreteActions, max_episode_steps=50)
