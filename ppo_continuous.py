@@ -32,6 +32,7 @@ import traceback
 import warnings
 import zipfile
 from contextlib import ExitStack, contextmanager, suppress
+from copy import deepcopy
 from dataclasses import asdict, dataclass, field, fields, replace
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -751,6 +752,8 @@ class Task(gym.Wrapper):
         super().__init__(env)
         self.facts, self.episode_seed, self.episode_step = facts, None, 0
         self.obs_shape, self.action_dtype = env.observation_space.shape, env.action_space.dtype
+        with suppress(AttributeError):  # where it is computed anew at every access
+            self.unwrapped.action_space = deepcopy(self.unwrapped.action_space)  # copies of a task often share it
         open_tasks.append(self)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
@@ -1084,7 +1087,9 @@ class Run:
         self.last_return = self.last_evaluation = "-"  # shown by the progress bar
         self.stack = ExitStack()  # what is to be closed, however the run ends
         self.progress = Progress()
-        if not str(self.dir).isprintable():
+        try:
+            str(self.dir).encode()
+        except UnicodeEncodeError:  # it has bytes that the locale cannot decode
             refuse(f"this locale cannot spell the folder {ascii(str(self.dir))}; PYTHONUTF8=1 helps")
         try:
             self.dir.mkdir(parents=True, exist_ok=True)

@@ -36,6 +36,13 @@ def random_returns(task: str, episodes: int, seed: int) -> np.ndarray:
     return returns
 
 
+def obs_dim(task: str) -> int:
+    """Numbers in an observation; the report counts an actor's parameters by it."""
+    env = gym.make(task, disable_env_checker=True)
+    env.close()
+    return gym.spaces.flatdim(env.observation_space)
+
+
 def reference(task: str, paper: list[dict]) -> tuple[float, str]:
     """The return that counts as 1, and where it comes from."""
     threshold = gym.spec(task).reward_threshold
@@ -53,11 +60,15 @@ def main():
     rows = []
     for task in dict.fromkeys(row["task"] for row in paper):
         returns, (best, source) = random_returns(task, EPISODES, SEED), reference(task, paper)
-        rows.append([task, f"{returns.mean():.6g}", f"{returns.std(ddof=1):.6g}", EPISODES, f"{best:g}", source])
+        rows.append(
+            [task, obs_dim(task), f"{returns.mean():.6g}", f"{returns.std(ddof=1):.6g}", EPISODES, f"{best:g}", source]
+        )
         print(*rows[-1], sep=", ", flush=True)
     with open(HERE / "bounds.csv", "w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["task", "random_return", "random_std", "random_episodes", "reference_return", "reference"])
+        writer.writerow(
+            ["task", "obs_dim", "random_return", "random_std", "random_episodes", "reference_return", "reference"]
+        )
         writer.writerows(rows)
 
 

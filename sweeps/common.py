@@ -6,6 +6,7 @@ python sweeps/common.py PARENT COMMAND...    becomes COMMAND, which is told to s
 import ctypes
 import os
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -33,6 +34,14 @@ def duration(seconds: float) -> str:
         if seconds >= length:
             return f"{seconds / length:,.1f} {unit}"
     return f"{seconds:.0f} s"
+
+
+def write_atomically(path: Path, text: str):
+    """Replace a file in one step, whatever other processes write at the same time."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}")
+    temporary.write_text(text)
+    os.replace(temporary, path)
 
 
 def start(command: list, log: BinaryIO) -> subprocess.Popen:
