@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from conftest import make_agent, run
-from test_algorithm import COEFFICIENTS, network, refine
+from test_algorithm import COEFFICIENTS, network, refine, rewards_of_an_episode
 from test_commands import QUICK, call_main, read_json
 from threadpoolctl import threadpool_info
 
@@ -91,16 +91,6 @@ def test_an_action_does_not_depend_on_its_neighbours_with_other_kernels(kernel):
 # --- A loop of one's own ----------------------------------------------------------------------------------------------
 
 
-def own_return(env: gym.Env, agent, seed: int) -> float:
-    obs, _ = env.reset(seed=seed)
-    episode_return, ended = 0.0, False
-    while not ended:
-        obs, reward, terminated, truncated, _ = env.step(agent.act(obs))
-        episode_return += reward
-        ended = terminated or truncated
-    return episode_return
-
-
 @pytest.mark.parametrize("env_id", ["Pendulum-v1", pytest.param("HalfCheetah-v5", marks=pytest.mark.slow)])
 def test_a_loop_of_ones_own_gives_the_runs_returns(script, tmp_path, capsys, env_id):
     """Digit for digit, whether alone, as here, or beside others, as in the run."""
@@ -111,8 +101,8 @@ def test_a_loop_of_ones_own_gives_the_runs_returns(script, tmp_path, capsys, env
         agent, path = script.load_agent(tmp_path / f"{name}.pt"), tmp_path / f"{name}.pt"
         seeds = script.evaluation_seeds(agent.args, result[name]["global_step"], final=True)
         env, plain = script.make_env(agent.args), gym.make(env_id)
-        assert [own_return(env, agent, seed) for seed in seeds] == result[name]["returns"]
-        assert own_return(plain, agent, seeds[-1]) == result[name]["returns"][-1]
+        assert [sum(rewards_of_an_episode(env, agent, seed)) for seed in seeds] == result[name]["returns"]
+        assert sum(rewards_of_an_episode(plain, agent, seeds[-1])) == result[name]["returns"][-1]
         capsys.readouterr()
         call_main(script, "--evaluate", path, "--final-eval-episodes", 1)
         printed = capsys.readouterr().out.splitlines()

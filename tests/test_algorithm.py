@@ -8,11 +8,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from conftest import make_agent, policy_mean
+from conftest import make_agent
 from gymnasium.spaces import Box
 from sklearn.metrics import explained_variance_score
 from test_commands import QUICK, call_main, read_events
-from torch import nn
 
 import ppo_continuous
 import refineppo_continuous
@@ -99,31 +98,19 @@ def test_one_step_is_f_of_s_and_0():
 @pytest.mark.parametrize("schedule, depth", [key for key in COEFFICIENTS if key[1] > 1] + [("average", 1)])
 def test_gradient_of_the_chain_against_finite_differences(schedule, depth):
     """Central differences of the plain loop, for every parameter: the gradient flows through all K steps."""
-    weights, rng = random_network([5, 4, 4, 2]), np.random.default_rng(1)
-    obs, direction = rng.normal(size=(6, 3)), rng.normal(size=(6, 2))
-    parameters = [x for layer in weights for x in layer]
+    shapes, rng, h = ((5, 4), (4,), (4, 4), (4,), (4, 2), (2,)), np.random.default_rng(1), 1e-6
+    starts = np.cumsum([0, *map(math.prod, shapes)])
+    x, obs, direction = (rng.normal(size=size) for size in (starts[-1], (6, 3), (6, 2)))
 
-    def objective():
-        return (direction * refine(weights, obs, COEFFICIENTS[schedule, depth])[-1]).sum()
+    def m_K(function, x, obs):
+        parts = [x[a:b].reshape(shape) for a, b, shape in zip(starts, starts[1:], shapes)]
+        return function(list(zip(parts[::2], parts[1::2])), obs, COEFFICIENTS[schedule, depth])[-1]
 
-    def in_tensors(*tensors):
-        weights = list(zip(tensors[::2], tensors[1::2]))
-        m_K = refineppo_continuous.proposals(weights, COEFFICIENTS[schedule, depth], torch.tensor(obs))[-1]
-        return (torch.tensor(direction) * m_K).sum()
-
-    tensors = [torch.tensor(x, requires_grad=True) for x in parameters]
-    gradients = torch.autograd.grad(in_tensors(*tensors), tensors)
-    h = 1e-6
-    for parameter, gradient in zip(parameters, gradients):
-        for i in np.ndindex(parameter.shape):
-            value = parameter[i]
-            parameter[i] = value + h
-            above = objective()
-            parameter[i] = value - h
-            below = objective()
-            parameter[i] = value
-            assert gradient[i].item() == pytest.approx((above - below) / (2 * h), rel=1e-6, abs=1e-8)
-    assert torch.autograd.gradcheck(in_tensors, tensors)
+    tensor = torch.tensor(x, requires_grad=True)
+    mean = m_K(lambda weights, obs, c: refineppo_continuous.proposals(weights, c, obs), tensor, torch.tensor(obs))
+    (torch.tensor(direction) * mean).sum().backward()
+    slopes = [(m_K(refine, x + step, obs) - m_K(refine, x - step, obs)) / (2 * h) for step in h * np.eye(len(x))]
+    np.testing.assert_allclose(tensor.grad, (direction * slopes).sum((1, 2)), rtol=1e-6, atol=1e-8)
 
 
 def test_refinement_scalars_by_hand():
@@ -155,23 +142,6 @@ def test_refinement_scalars_by_hand():
 
 
 # --- Networks and their initial values --------------------------------------------------------------------------------
-
-
-def sequential(weights):
-    """The same network in torch's modules, which store (out, in)."""
-    modules = []
-    for w, b in weights:
-        linear = nn.Linear(*w.shape, dtype=w.dtype)
-        linear.weight.data, linear.bias.data = w.T.clone(), b.clone()
-        modules += [linear, nn.Tanh()]
-    return nn.Sequential(*modules[:-1])
-
-
-@pytest.mark.parametrize("hidden", [(8,), (8, 8), (16, 8, 4)])
-def test_network_against_torch_modules(script, hidden):
-    weights = [tuple(map(torch.tensor, layer)) for layer in random_network([3, *hidden, 1])]
-    obs = torch.tensor(np.random.default_rng(1).normal(size=(7, 3)))
-    torch.testing.assert_close(script.network(weights, obs), sequential(weights)(obs), rtol=0, atol=1e-12)
 
 
 def test_initial_parameters(script):
@@ -571,6 +541,16 @@ def test_learning_rate_is_annealed_as_in_cleanrl(script, tmp_path):
 # --- Evaluation -------------------------------------------------------------------------------------------------------
 
 
+def rewards_of_an_episode(env: gym.Env, agent, seed: int) -> list[float]:
+    """A loop of one's own over `act`, which test_agent.py compares with a plain loop over the network."""
+    (obs, _), rewards, ended = env.reset(seed=seed), [], False
+    while not ended:
+        obs, reward, terminated, truncated, _ = env.step(agent.act(obs))
+        rewards.append(reward)
+        ended = terminated or truncated
+    return rewards
+
+
 class Watched(gym.Wrapper):
     """Notes every reset's seed, and refuses to be stepped beyond its episode's end."""
 
@@ -592,30 +572,17 @@ class Watched(gym.Wrapper):
 def test_evaluation_against_plain_loop(script, monkeypatch, env_id):
     """One deterministic episode per seed, and nothing of the training is touched."""
     agent, envs = agent_and_envs(script, env_id, num_envs=2)
-    agent.params = {name: p.double() for name, p in agent.params.items()}  # so that rounding cannot grow visible
     agent.params["actor.2.weight"] *= 50
     script.collect(agent, envs, 100, np.random.default_rng(0))
-    seeds, make_env = [11, 7, 11, 13], script.make_env
+    seeds, make_env, before = [11, 7, 11, 13], script.make_env, copies(agent)
     monkeypatch.setattr(Watched, "resets", [])
     monkeypatch.setattr(script, "make_env", lambda *args, **facts: Watched(make_env(*args, **facts)))
-    before = copies(agent)
     returns, lengths = script.evaluate(agent, seeds)
     assert Watched.resets == seeds
     assert_same(before, copies(agent))
-
-    mean, std = agent.normalizer.obs.mean, np.sqrt(agent.normalizer.obs.squares / agent.normalizer.obs.count + 1e-8)
     for seed, episode_return, length in zip(seeds, returns, lengths, strict=True):
-        env, rewards, ended = gym.make(env_id), [], False
-        obs, _ = env.reset(seed=seed)
-        while not ended:
-            normalised = np.clip((obs - mean) / std, -10, 10).astype("f").astype(float)[None]
-            action = policy_mean(script, agent.params, agent.args, torch.tensor(normalised))[0].numpy()
-            action = np.clip(action, env.action_space.low, env.action_space.high).astype("f")
-            obs, reward, terminated, truncated, _ = env.step(action)
-            rewards.append(reward)
-            ended = terminated or truncated
-        assert length == len(rewards)
-        assert episode_return == pytest.approx(sum(rewards), rel=1e-6)
+        rewards = rewards_of_an_episode(gym.make(env_id), agent, seed)
+        assert (episode_return, length) == (sum(rewards), len(rewards))
     assert returns[0] == returns[2]
 
 

@@ -47,9 +47,8 @@ def commands(block: str) -> list[list[str]]:
 
 
 def python(*words, folder: Path) -> str:
-    paths = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
-    done = subprocess.run([sys.executable, *words], cwd=folder, env=os.environ | {"PYTHONPATH": paths},
-                          capture_output=True, text=True)  # fmt: skip
+    env = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, *words], cwd=folder, env=env, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -85,9 +84,9 @@ def run_command(words: list[str], folder: Path):
             cut = words.index("|")
             chosen = dict(word.split("=") for word in words[:cut] if "=" in word)
             generator, (executor, *flags) = words[len(chosen) : cut], words[cut + 1 :]
-            jobs = subprocess.run(generator, cwd=ROOT, env=os.environ | chosen, capture_output=True, text=True)
-            planned = subprocess.run([executor, "--dry-run", *flags], cwd=ROOT, input=jobs.stdout,
-                                     capture_output=True, text=True)  # fmt: skip
+            chosen, dry = os.environ | chosen, [executor, "--dry-run", *flags]
+            jobs = subprocess.run(generator, cwd=ROOT, env=chosen, capture_output=True, text=True)
+            planned = subprocess.run(dry, cwd=ROOT, input=jobs.stdout, capture_output=True, text=True)
             assert (jobs.returncode, planned.returncode) == (0, 0), jobs.stderr + planned.stderr
             assert jobs.stdout.count("_continuous.py --env-id") == planned.stdout.count("_continuous.py --env-id") > 0
         case ["python", "sweeps/tune.py", *flags]:
@@ -110,6 +109,7 @@ def run_command(words: list[str], folder: Path):
             pytest.fail(f"no test runs the README's command: {shlex.join(words)}")
 
 
+@pytest.mark.slow
 def test_every_command_and_snippet(tmp_path):
     ran = []
     for language, content in blocks(readme()):
