@@ -1,60 +1,65 @@
 """What refinement does in a trained policy, from its checkpoints: the paper's two analyses, and what follows from them.
 
     python analysis_refinement.py --checkpoint runs/.../best.pt
-    python analysis_refinement.py --checkpoint runs/seed-*/best.pt --sections settling r2 anytime adaptive dynamics
+    python analysis_refinement.py --checkpoint runs/seed-*/best.pt --sections settling r2 feedback
     python analysis_refinement.py --checkpoint runs/.../step_*.pt --sections training
 
     settling  how far each action component still is from its end after k steps: e_{k,j}, figure 3a of the paper
     r2        whether early components predict the next correction of late ones: delta R^2, figure 3b, beside three
               checks: early components shuffled across states, folds of whole episodes, the observation in both models
-    anytime   return of the policy stopped after k = 0..2K steps; past K uniform goes on with c_k = 1, inverse with
-              1/k, and average with its own 1/K
+    feedback  whether f uses what it reads: the return if it reads, in place of m_k, zero or the m_k of another state;
+              and how well a network of one pass reproduces m_K
+    anytime   return of the policy stopped after k = 0..2K steps, m_k and (K/k) m_k; past K uniform goes on with
+              c_k = 1, inverse with 1/k, and average with its own 1/K
     adaptive  return and mean number of steps if a state's refinement stops once a correction is small
     dynamics  corrections, Jacobians of one step, spread left of random starts, proposals outside the action bounds
-    training  settling, r2 and dynamics against the training step, from several checkpoints of a run (--save-every)
+    training  settling, r2, dynamics and the return lost if f reads zero against the training step, from several
+              checkpoints of a run (--save-every), and beside them the run's learning curve
 
-Each section writes CSVs, figures and its part of summary.json into --out-dir, all at the end. With several checkpoints
-the CSVs gain a `checkpoint` column, and if these are seeds of one setting there are also `*_across_seeds.csv`, with the
-mean and standard deviation (ddof 1).
+Every policy here is deterministic, and its actions are clipped to their bounds. Each section writes CSVs, figures and
+its part of summary.json into --out-dir, all at the end. With several checkpoints the CSVs gain a `checkpoint` column,
+and if these are seeds of one setting there are also `*_across_seeds.csv`, with the mean and standard deviation
+(ddof 1).
 """
 
-import csv
 import io
 import json
 import tempfile
-import zipfile
-from collections.abc import Iterator
-from contextlib import suppress
+import warnings
+from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import gymnasium as gym
 import mujoco
 import numpy as np
+import pandas as pd
 import sklearn
 import torch
 import tyro
 from matplotlib import colormaps, rc_context
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from sklearn.linear_model import Ridge
-from sklearn.model_selection import GroupKFold, KFold, cross_val_score
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
+from sklearn import linear_model, metrics, model_selection, neural_network, pipeline, preprocessing
+from sklearn.exceptions import ConvergenceWarning
+from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 import refineppo_continuous as refineppo
-from refineppo_continuous import Actor, Agent, layers, mean_and_std, refuse
+from refineppo_continuous import Agent, layers, mean_and_std, refuse
 
 FOLDS, MIN_EPISODES, SHUFFLES, STARTS = 5, 20, 50, 8  # of a regression, recorded, of early components, per state
-SHUFFLED_FOLDS = KFold(FOLDS, shuffle=True, random_state=0)
-QUANTILES = (0.0, 0.02, 0.1, 0.3, 0.6, 0.9)  # of the corrections' norms: the tolerances of `adaptive`
+SHUFFLED_FOLDS = model_selection.KFold(FOLDS, shuffle=True, random_state=0)
+FEEDBACK_EPISODES, TRAINING_EPISODES = 20, 10  # behind each return of `feedback`, and of it in `training`
+FIT_STATES, TOLERANCES = 20_000, 8  # to which the network of one pass is fitted; that `adaptive` tries
 
-Section = Literal["settling", "r2", "anytime", "adaptive", "dynamics", "training"]
+Section = Literal["settling", "r2", "feedback", "anytime", "adaptive", "dynamics", "training"]
 Rows = list[dict]  # of a table
+Mean = Callable[[np.ndarray], np.ndarray]  # normalised observations (n, obs_dim) -> action means (n, action_dim)
 progress = partial(tqdm, disable=None, leave=False)  # on a terminal only
 
 
@@ -71,7 +76,7 @@ class Args:
     episodes: int = 5
     """episodes behind each return of `anytime` and `adaptive`"""
     seed: int = 0
-    """seed of the recorded episodes, the shuffles and the random starts"""
+    """seed of the recorded episodes, the shuffles, the random starts, the fit and the states drawn for `feedback`"""
     out_dir: Path | None = None
     """folder of the results; default analysis/ beside the first checkpoint"""
 
@@ -90,13 +95,24 @@ class Policy:
     global_step: int
     names: list[str]
 
-    @property
-    def args(self) -> refineppo.Args:
-        return self.agent.args
+    def __post_init__(self):
+        self.args, self.weights = self.agent.args, layers(self.agent.arrays(), "actor")
+        self.coefficients = refineppo.refinement_coefficients(self.args.refinement_schedule, self.args.refinement_depth)
+        self.label = f"seed {self.args.seed}, step {self.global_step:,}"
 
-    @property
-    def label(self) -> str:
-        return f"seed {self.args.seed}, step {self.global_step:,}"
+    def proposals(self, obs: np.ndarray, coefficients: list[float] | None = None) -> np.ndarray:
+        """m_0 = 0, m_1, ..., m_K, (K + 1, n, action_dim), or with other coefficients; rounded as where it acts."""
+        coefficients = coefficients or self.coefficients
+        m = refineppo.in_rows_of_8(lambda rows: np.stack(refineppo.proposals(self.weights, coefficients, rows)), obs)
+        return np.concatenate([np.zeros_like(m[:1]), m])
+
+    def mean(self, coefficients: list[float] | None = None, scale: float = 1.0) -> Mean:
+        """Acting with m_K, or with `scale` times where the refinement ends with other coefficients."""
+        return lambda obs: scale * self.proposals(obs, coefficients)[-1]
+
+    def reading_zero(self) -> Mean:
+        """Acting with (c_1 + ... + c_K) f(s, 0), where the refinement ends if f reads zero at every step."""
+        return self.mean([1.0], scale=sum(self.coefficients))
 
 
 # --- Input ------------------------------------------------------------------------------------------------------------
@@ -104,34 +120,27 @@ class Policy:
 
 def load_policy(path: Path) -> Policy:
     """A checkpoint's policy on the CPU, or a refusal."""
-    ppo_flags = {field.name for field in fields(refineppo.Args)} - {"refinement_depth", "refinement_schedule"}
-    with suppress(Exception):  # load_checkpoint says what is wrong with a file that cannot be read
-        if zipfile.is_zipfile(path) and set(torch.load(path, "cpu", weights_only=True)["args"]) == ppo_flags:
-            refuse(f"{path} is a checkpoint of PPO, which has no refinement to analyse")
-    saved = refineppo.load_checkpoint(path)
     try:
-        here = {"evaluate": str(path), "cuda": False, "track": False, "capture_video": False}
-        args = refineppo.Args(**saved["args"] | here)
-        agent = Agent(*refineppo.check_args(args), args)
-        agent.load(saved)
-        step = int(saved["global_step"])
-    except Exception:  # the right flags, but parts missing or of other shapes
-        refuse(f"{path} is damaged: it does not hold a policy for its task")
-    if not all(p.isfinite().all() for part in agent.tensors().values() for p in part.values()):
+        saved = set(torch.load(path, "cpu", weights_only=True)["args"])
+    except Exception:  # `load_agent` says what is wrong with a file that cannot be read
+        saved = set()
+    if saved == {field.name for field in fields(refineppo.Args)} - {"refinement_depth", "refinement_schedule"}:
+        refuse(f"{path} is a checkpoint of PPO, which has no refinement to analyse")
+    agent, checkpoint = refineppo.load_agent(path), refineppo.load_checkpoint(path)
+    if not all(x.isfinite().all() for part in ("params", "normalizer") for x in checkpoint[part].values()):
         refuse(f"{path} holds parameters that are not finite")
-    if args.refinement_depth == 1:
+    if agent.args.refinement_depth == 1:
         refuse(f"{path} has refinement depth K = 1: one step, so that there is no refinement to analyse")
-    return Policy(path, agent, step, component_names(args.env_id))
+    return Policy(path, agent, checkpoint["global_step"], component_names(agent.args.env_id))
 
 
 def component_names(env_id: str) -> list[str]:
     """Of each action component: the joint that its actuator drives, else the actuator's name, else a0, ...; unique."""
-    env = refineppo.make_env(env_id)
+    env = gym.make(env_id, disable_env_checker=True)
     model, names = getattr(env.unwrapped, "model", None), [""] * env.action_space.shape[0]
     if isinstance(model, mujoco.MjModel) and model.nu == len(names):
-        on_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
-        names = [on_joint[i] and model.joint(model.actuator_trnid[i, 0]).name or model.actuator(i).name
-                 for i in range(model.nu)]  # fmt: skip
+        joints = np.where(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, model.actuator_trnid[:, 0], -1)
+        names = [joint >= 0 and model.joint(joint).name or model.actuator(i).name for i, joint in enumerate(joints)]
     env.close()
     names = [name or f"a{i}" for i, name in enumerate(names)]
     return [name if names.count(name) == 1 else f"{name} (a{i})" for i, name in enumerate(names)]
@@ -155,9 +164,10 @@ def check(args: Args) -> list[Policy]:
             refuse(f"the checkpoints must have the same task, depth and schedule: {both}")
     if set(args.sections) == {"r2"} and len(policies[0].names) == 1:
         refuse(f"an action of {settings[0][0]} has one component, which no other can inform: there is no delta R^2")
-    seeds = [seed for seed, _ in {(p.args.seed, p.global_step) for p in policies}]
-    if "training" in args.sections and any(seeds.count(seed) == 1 for seed in seeds):
-        refuse("--sections training needs checkpoints of each run at two or more training steps (see --save-every)")
+    if "training" in args.sections:
+        seeds = [seed for seed, _ in {(p.args.seed, p.global_step) for p in policies}]
+        if any(seeds.count(seed) == 1 for seed in seeds):
+            refuse("--sections training needs checkpoints of each run at two or more training steps (see --save-every)")
     try:
         args.folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=args.folder).close()
@@ -166,56 +176,28 @@ def check(args: Args) -> list[Policy]:
     return policies
 
 
-# --- Acting -----------------------------------------------------------------------------------------------------------
-
-
-def with_start(proposals: list[np.ndarray]) -> np.ndarray:
-    """m_0 = 0, m_1, ..., m_K, (K + 1, batch, action_dim), from m_1, ..., m_K."""
-    return np.stack([np.zeros_like(proposals[0]), *proposals])
-
-
 def correction_norms(proposals: np.ndarray) -> np.ndarray:
     """||m_k - m_{k-1}|| for k = 1..K, (K, batch), of proposals (K + 1, batch, action_dim)."""
     return np.linalg.norm(np.diff(proposals, axis=0), axis=-1)
 
 
-def steps_used(proposals: np.ndarray, tolerance: float) -> np.ndarray:
-    """The first step k >= 1 whose correction's norm is below the tolerance, else K, (batch,)."""
-    small = correction_norms(proposals) < tolerance
-    return np.where(small.any(0), small.argmax(0) + 1, len(small))
+def run_episodes(policy: Policy, mean: Mean, seeds: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns and lengths of one episode per seed, acting with `mean` clipped to the action bounds. They run one after
+    the other, so that `mean` sees the states of an episode once each and in order."""
+    acting = copy(policy.agent)
+    acting.act = lambda obs: np.clip(mean(acting.normalizer.normalize(obs)), acting.low, acting.high)
+    returns, lengths = zip(*(refineppo.evaluate(acting, [seed]) for seed in seeds))
+    return np.concatenate(returns), np.concatenate(lengths)
 
 
-class RecordingActor:
-    """An agent's actor, which keeps the observations it acts on; with the policy's noise if `rng` is given."""
-
-    def __init__(self, agent: Agent, rng: np.random.Generator | None, bar: tqdm):
-        self.actor, self.std, self.rng, self.bar = agent.actor, np.exp(agent.arrays()["log_std"]), rng, bar
-        self.obs = []
-
-    def mean(self, weights: list, obs: np.ndarray) -> np.ndarray:
-        self.obs.append(obs)
-        self.bar.update()
-        m = self.actor.mean(weights, obs)
-        return m if self.rng is None else m + self.std * self.rng.standard_normal(m.shape)
-
-
-class AdaptiveActor:
-    """An actor that leaves a state's refinement after the first correction smaller than the tolerance."""
-
-    def __init__(self, actor: Actor, tolerance: float):
-        self.actor, self.tolerance, self.steps = actor, tolerance, []
-
-    def mean(self, weights: list, obs: np.ndarray) -> np.ndarray:
-        proposals = with_start(self.actor.proposals(weights, obs))
-        self.steps.append(steps_used(proposals, self.tolerance))
-        return proposals[self.steps[-1], np.arange(len(obs))]
-
-
-def run_episodes(agent: Agent, actor, seeds: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns and lengths of one episode per seed, the agent acting with `actor`."""
-    agent = copy(agent)
-    agent.actor = actor
-    return refineppo.evaluate(agent, seeds)
+def final_returns(policy: Policy, mean: Mean, episodes: int) -> tuple[np.ndarray, dict]:
+    """Returns in the episodes of `refineppo_continuous.py --evaluate`, the same for every mean; and a table's columns
+    of them."""
+    args = replace(policy.args, final_eval_episodes=episodes)
+    seeds = refineppo.evaluation_seeds(args, policy.global_step, final=True)
+    returns, lengths = run_episodes(policy, mean, seeds)
+    average, std = mean_and_std(returns)
+    return returns, {"return_mean": average, "return_std": std, "length_mean": lengths.mean()}
 
 
 def spread_evenly(lengths: np.ndarray, total: int) -> list[np.ndarray]:
@@ -228,17 +210,25 @@ def spread_evenly(lengths: np.ndarray, total: int) -> list[np.ndarray]:
     return chosen
 
 
-def record_states(policy: Policy, args: Args) -> tuple[np.ndarray, np.ndarray]:
-    """Normalised observations (S, obs_dim) of 20 episodes, or more if they are short; and each one's episode, (S,)."""
-    rng, episodes = np.random.default_rng(args.seed) if args.sample_actions else None, []
+def record_states(policy: Policy, args: Args, stream: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    """Normalised observations (S, obs_dim) of 20 episodes, or more if they are short; and each one's episode, (S,).
+    Another `stream` has other episodes."""
+    own, std, rng = policy.mean(), np.exp(policy.agent.arrays()["log_std"]), np.random.default_rng(args.seed)
+    episodes = []
+
+    def mean(obs: np.ndarray) -> np.ndarray:
+        episodes[-1].append(obs)
+        bar.update()
+        m = own(obs)
+        return m + std * rng.standard_normal(m.shape) if args.sample_actions else m
+
     with progress(desc=f"episodes of {policy.label}", unit=" steps") as bar:
         while sum(map(len, episodes)) < args.num_states:
-            recorder = RecordingActor(policy.agent, rng, bar)
-            seeds = refineppo.episode_seeds(args.seed, 2, len(episodes), count=MIN_EPISODES)
-            _, lengths = run_episodes(policy.agent, recorder, seeds)
-            episodes += [obs[:length] for obs, length in zip(np.stack(recorder.obs, axis=1), lengths)]
+            for seed in refineppo.episode_seeds(args.seed, stream, len(episodes), count=MIN_EPISODES):
+                episodes.append([])
+                run_episodes(policy, mean, [seed])
     chosen = spread_evenly(np.array([len(obs) for obs in episodes]), args.num_states)
-    obs = np.concatenate([obs[steps] for obs, steps in zip(episodes, chosen)])
+    obs = np.concatenate([np.concatenate(obs)[steps] for obs, steps in zip(episodes, chosen)])
     return obs, np.repeat(np.arange(len(chosen)), [len(steps) for steps in chosen])
 
 
@@ -264,25 +254,35 @@ def early_and_late(error: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return order, order[:count], order[len(order) - count :]
 
 
-def ridge_r2(features: list[np.ndarray], target: np.ndarray, folds=SHUFFLED_FOLDS, groups=None) -> float:
-    """Cross-validated R^2, mean over folds, of ridge regression (alpha 1) of target (S,) on standardised features."""
-    model = make_pipeline(StandardScaler(), Ridge(alpha=1.0))
+def ridge_r2(features: np.ndarray, target: np.ndarray, folds=SHUFFLED_FOLDS, groups=None) -> float:
+    """Cross-validated R^2, mean over folds, of ridge regression (alpha 1) of target (S,) on scaled features (S, n)."""
+    model = pipeline.make_pipeline(preprocessing.StandardScaler(), linear_model.Ridge(alpha=1.0))
+    data = {"X": features, "y": target, "cv": folds, "groups": groups}
     with sklearn.config_context(assume_finite=True, skip_parameter_validation=True):  # a quarter of the time
-        return cross_val_score(model, np.column_stack(features), target, groups=groups, cv=folds, scoring="r2").mean()
+        return model_selection.cross_val_score(model, **data, scoring="r2").mean()
 
 
-def delta_r2(own: list[np.ndarray], early: np.ndarray, target: np.ndarray, **folds) -> float:
-    """What the early components' values (S, n) add to the R^2 of a component's next correction from its `own`."""
-    return ridge_r2([*own, early], target, **folds) - ridge_r2(own, target, **folds)
-
-
-def refinement_field(weights: list, obs: torch.Tensor, m: torch.Tensor) -> torch.Tensor:
-    """f(s, m), (..., action_dim), of obs (..., obs_dim) and any proposal m (..., action_dim)."""
+def refinement_field(weights: list, obs, m):
+    """f(s, m), (..., action_dim), of obs (..., obs_dim) and any m (..., action_dim); all arrays or all tensors."""
+    library = np if isinstance(obs, np.ndarray) else torch
     *hidden, (w_out, b_out) = weights
-    x = torch.cat([obs, m], dim=-1)
+    x = library.concatenate([obs, m], -1)
     for w, b in hidden:
-        x = torch.tanh(x @ w + b)
+        x = library.tanh(x @ w + b)
     return x @ w_out + b_out
+
+
+def fit_one_pass(obs: np.ndarray, target: np.ndarray, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """(weight, bias) pairs of a network obs -> 128 tanh -> 128 tanh -> target, fitted by least squares on components
+    of equal weight. A tenth of the states says when to stop."""
+    centre, scale = target.mean(0), np.maximum(target.std(0), 1e-8)
+    network = neural_network.MLPRegressor(
+        hidden_layer_sizes=(128, 128), activation="tanh", early_stopping=True, random_state=seed
+    )
+    with warnings.catch_warnings(action="ignore", category=ConvergenceWarning):  # 200 epochs are enough
+        network.fit(obs, ((target - centre) / scale).squeeze())
+    *hidden, (w_out, b_out) = zip(network.coefs_, network.intercepts_)
+    return [*hidden, (w_out * scale, b_out * scale + centre)]
 
 
 def step_jacobians(weights: list, obs: torch.Tensor, m: torch.Tensor, c: float) -> torch.Tensor:
@@ -301,11 +301,11 @@ def start_spread(weights: list, obs: torch.Tensor, starts: torch.Tensor, coeffic
     return torch.stack(spreads).div(spreads[0]).numpy()
 
 
-def dynamics(agent: Agent, obs: np.ndarray, proposals: np.ndarray, seed: int) -> dict[str, dict[int, np.ndarray]]:
+def dynamics(policy: Policy, obs: np.ndarray, proposals: np.ndarray, seed: int) -> dict[str, dict[int, np.ndarray]]:
     """The refinement as a dynamical system: quantity -> step k -> its value in every state, (S,)."""
+    agent, coefficients = policy.agent, policy.coefficients
     weights = layers({name: p.double() for name, p in agent.params.items()}, "actor")
-    obs, coefficients = torch.from_numpy(obs).double(), agent.actor.coefficients
-    space = gym.spaces.Box(agent.low, agent.high, seed=seed)
+    obs, space = torch.from_numpy(obs).double(), gym.spaces.Box(agent.low, agent.high, seed=seed)
     starts = torch.from_numpy(np.array([[space.sample() for _ in obs] for _ in range(STARTS)])).double()
     outside = ((proposals < agent.low) | (proposals > agent.high)).astype(float)
     norms, steps = correction_norms(proposals), range(1, len(proposals))
@@ -331,80 +331,123 @@ def dynamics(agent: Agent, obs: np.ndarray, proposals: np.ndarray, seed: int) ->
 def settling_rows(proposals: np.ndarray, names: list[str]) -> Rows:
     """Every e_{k,j}, in the order of e_{1,j}."""
     error = settling_error(proposals)
-    order, _, _ = early_and_late(error)
-    return [{"component": names[j], "rank": rank, "step": k, "error": error[k, j]}
-            for rank, j in enumerate(order, start=1) for k in range(len(error))]  # fmt: skip
+    ranked = list(enumerate(early_and_late(error)[0], start=1))
+    return [dict(component=names[j], rank=r, step=k, error=error[k, j]) for r, j in ranked for k in range(len(error))]
 
 
-def transitions(proposals: np.ndarray, names: list[str]) -> Iterator[tuple[dict, np.ndarray, np.ndarray, np.ndarray]]:
-    """Every regression: its row's key, own value (S,), early components' values (S, n), next correction (S,)."""
+def r2_rows(proposals: np.ndarray, names: list[str]) -> Iterator[tuple[dict, np.ndarray, np.ndarray, np.ndarray]]:
+    """The paper's delta R^2 of every late component and transition; and what it was computed from: the component's own
+    value (S, 1), that and the early components' values (S, 1 + n), and the next correction (S,)."""
     _, early, late = early_and_late(settling_error(proposals))
     for j in late:
         for k in range(1, len(proposals) - 1):  # at k = 0 every input is zero
-            key = {"component": names[j], "step_from": k, "step_to": k + 1}
-            yield key, proposals[k][:, j], proposals[k][:, early], proposals[k + 1][:, j] - proposals[k][:, j]
+            own, both = proposals[k][:, [j]], proposals[k][:, [j, *early]]
+            target = proposals[k + 1][:, j] - proposals[k][:, j]
+            row = {"component": names[j], "step_from": k, "step_to": k + 1}
+            row |= {"r2_baseline": ridge_r2(own, target), "r2_augmented": ridge_r2(both, target)}
+            yield row | {"delta_r2": row["r2_augmented"] - row["r2_baseline"]}, own, both, target
 
 
-def r2_rows(proposals: np.ndarray, names: list[str]) -> Rows:
-    """The paper's delta R^2 of every late component and transition."""
-    rows = []
-    for key, own, early, target in transitions(proposals, names):
-        baseline, augmented = ridge_r2([own], target), ridge_r2([own, early], target)
-        rows.append(key | {"r2_baseline": baseline, "r2_augmented": augmented, "delta_r2": augmented - baseline})
+def r2_tables(proposals: np.ndarray, names: list[str], obs: np.ndarray, episodes: np.ndarray, seed: int):
+    """delta R^2; and beside it the middle 95 % of what early components shuffled across states give, folds of whole
+    episodes (states of one episode resemble each other), and the observation as a feature of both models."""
+    tables, rng = {"delta_r2": [], "delta_r2_checks": []}, np.random.default_rng(seed)
+    whole = {"folds": model_selection.GroupKFold(FOLDS), "groups": episodes}
+    for row, own, both, target in progress(r2_rows(proposals, names), desc="shuffled R^2"):
+        shuffled = [np.hstack([own, both[rng.permutation(len(own)), 1:]]) for _ in range(SHUFFLES)]
+        gains = [ridge_r2(features, target) - row["r2_baseline"] for features in shuffled]
+        low, high = np.quantile(gains, (0.025, 0.975))
+        check = {name: row[name] for name in ("component", "step_from", "step_to", "delta_r2")}
+        check |= {"shuffled_low": low, "shuffled_high": high, "above_shuffled": int(row["delta_r2"] > high)}
+        check["by_episode"] = ridge_r2(both, target, **whole) - ridge_r2(own, target, **whole)
+        given = np.hstack([own, obs])
+        check["given_observation"] = ridge_r2(np.hstack([given, both[:, 1:]]), target) - ridge_r2(given, target)
+        tables["delta_r2"].append(row)
+        tables["delta_r2_checks"].append(check)
+    return tables
+
+
+def feedback_rows(policy: Policy, obs: np.ndarray, proposals: np.ndarray, args: Args) -> Rows:
+    """Whether the policy uses what f reads, by what is lost if f reads something else, x_k, in place of m_k, while the
+    corrections add up as before: m_K = c_1 f(s, x_0) + ... + c_K f(s, x_{K-1}).
+
+        own            x_k = m_k(s), as trained
+        zero           x_k = 0 at every step, so that m_K = (c_1 + ... + c_K) f(s, 0)
+        another_state  x_k = m_k(s'); the state s' is drawn anew at every step of an episode, uniformly from the
+                       recorded ones: `obs` (S, obs_dim), whose m_0, ..., m_K are `proposals` (K + 1, S, action_dim)
+        one_pass       no f: a network s -> 128 tanh -> 128 tanh -> action, fitted to m_K(s) in 20,000 states of other
+                       episodes of the policy
+
+    return: of 20 episodes, the same ones for every row; lost: the own return minus this one, paired by episode; r2: R^2
+    with which the row's m_K reproduces the own one in the recorded states, mean over action components.
+    """
+    pool, rng, own = proposals.astype(np.float32), np.random.default_rng(args.seed), policy.mean()
+    states, _ = record_states(policy, replace(args, num_states=FIT_STATES), stream=3)
+    network = fit_one_pass(states, own(states), args.seed)
+
+    def another_state(obs: np.ndarray) -> np.ndarray:
+        drawn = pool[:, rng.integers(pool.shape[1], size=len(obs))]
+        return sum(c * refinement_field(policy.weights, obs, x) for c, x in zip(policy.coefficients, drawn))
+
+    def one_pass(obs: np.ndarray) -> np.ndarray:
+        return refinement_field(network, obs, obs[:, :0])  # it reads no proposal
+
+    means = {"own": own, "zero": policy.reading_zero(), "another_state": another_state, "one_pass": one_pass}
+    rows, own_returns = [], None
+    for reads, mean in progress(means.items(), desc=f"feedback, {policy.label}"):
+        returns, columns = final_returns(policy, mean, FEEDBACK_EPISODES)
+        own_returns = returns if mean is own else own_returns
+        lost, std = mean_and_std(own_returns - returns)
+        columns |= {"lost_mean": lost, "lost_std": std, "r2": metrics.r2_score(own(obs), mean(obs))}
+        rows.append({"reads": reads} | columns)
     return rows
 
 
-def r2_check_rows(proposals: np.ndarray, names: list[str], obs: np.ndarray, episodes: np.ndarray, seed: int) -> Rows:
-    """Beside the paper's delta R^2: the middle 95 % of what early components shuffled across states give, folds of
-    whole episodes (states of one episode resemble each other), and the observation as a feature of both models."""
-    rows, rng = [], np.random.default_rng(seed)
-    regressions = list(transitions(proposals, names))
-    for key, own, early, target in progress(regressions, desc="shuffled R^2"):
-        baseline = ridge_r2([own], target)
-        shuffled = [ridge_r2([own, early[rng.permutation(len(own))]], target) - baseline for _ in range(SHUFFLES)]
-        low, high = np.quantile(shuffled, (0.025, 0.975))
-        paper = delta_r2([own], early, target)
-        rows.append(key | {
-            "delta_r2": paper,
-            "shuffled_low": low,
-            "shuffled_high": high,
-            "above_shuffled": int(paper > high),
-            "by_episode": delta_r2([own], early, target, folds=GroupKFold(FOLDS), groups=episodes),
-            "given_observation": delta_r2([own, obs], early, target),
-        })  # fmt: skip
-    return rows
-
-
-def return_columns(policy: Policy, actor, episodes: int) -> tuple[dict, np.ndarray]:
-    """The return, acting with `actor` in the episodes of `refineppo_continuous.py --evaluate`; and their lengths."""
-    args = replace(policy.args, final_eval_episodes=episodes)
-    seeds = refineppo.evaluation_seeds(args, policy.global_step, final=True)
-    returns, lengths = run_episodes(policy.agent, actor, seeds)
-    mean, std = mean_and_std(returns)
-    return {"return_mean": mean, "return_std": std, "length_mean": lengths.mean()}, lengths
-
-
-def anytime_rows(policy: Policy, episodes: int) -> Rows:
-    """Return of the deterministic policy a = m_k for k = 0..2K."""
-    rows = []
-    coefficients = continued_coefficients(policy.args.refinement_schedule, policy.args.refinement_depth)
+def anytime_tables(policy: Policy, episodes: int) -> dict[str, Rows]:
+    """Return of a = m_k for k = 0..2K; and of a = (K/k) m_k for k = 1..2K, since under the average schedule m_k is
+    about k/K as large as m_K."""
+    depth, tables = policy.args.refinement_depth, {"anytime": [], "anytime_scaled": []}
+    coefficients = continued_coefficients(policy.args.refinement_schedule, depth)
     for k in progress(range(len(coefficients) + 1), desc=f"anytime, {policy.label}"):
-        actor = copy(policy.agent.actor)
-        actor.coefficients = coefficients[:k] or [0.0]  # m_0 = 0
-        rows.append({"steps": k} | return_columns(policy, actor, episodes)[0])
-    return rows
+        own = coefficients[:k] or [0.0]  # m_0 = 0
+        tables["anytime"].append({"steps": k} | final_returns(policy, policy.mean(own), episodes)[1])
+        if k:
+            _, columns = final_returns(policy, policy.mean(own, scale=depth / k), episodes)
+            tables["anytime_scaled"].append({"steps": k} | columns)
+    return tables
 
 
 def adaptive_rows(policy: Policy, norms: np.ndarray, episodes: int) -> Rows:
-    """Return against mean steps used, for tolerances at quantiles of the corrections' norms (K, S) before the last."""
-    rows = []
-    for quantile in progress(QUANTILES, desc=f"adaptive, {policy.label}"):
-        tolerance = float(np.quantile(norms[:-1], quantile)) if quantile else 0.0  # 0: always all K steps
-        actor = AdaptiveActor(policy.agent.actor, tolerance)
-        columns, lengths = return_columns(policy, actor, episodes)
-        used = [steps[:length] for steps, length in zip(np.stack(actor.steps, axis=1), lengths)]
-        rows.append({"quantile": quantile, "tolerance": tolerance, "steps_mean": np.concatenate(used).mean()} | columns)
-    return rows
+    """Return and mean steps used if a state's refinement ends with the first correction below a tolerance, for
+    tolerances that spread the mean steps as evenly as they can.
+
+    norms: of the corrections in recorded states, (K, S). A state has stopped by step k < K if the smallest of its
+    first k norms is below the tolerance; so the quantile q of these minima lets the recorded states use
+    K - (K - 1) q steps on average. But a policy that stops early comes to other states. So where the mean steps in the
+    episodes lie furthest apart, for two neighbouring quantiles from 0 and 1 on, the one half-way between is tried.
+    """
+    smallest, rows = np.minimum.accumulate(norms[:-1]), {}
+
+    def try_out(quantile: float, tolerance: float):
+        used = []
+
+        def mean(obs: np.ndarray) -> np.ndarray:
+            proposals = policy.proposals(obs)
+            small = correction_norms(proposals.astype(float)) < tolerance  # as precise as `norms`
+            used.append(np.where(small.any(0), small.argmax(0) + 1, len(small)))
+            return proposals[used[-1], np.arange(len(obs))]
+
+        _, columns = final_returns(policy, mean, episodes)
+        steps = {"tolerance": tolerance, "steps_mean": np.concatenate(used).mean()}
+        rows[quantile] = {"quantile": quantile} | steps | columns
+
+    try_out(0.0, 0.0)  # below all norms, so that all K steps are used
+    try_out(1.0, float(np.nextafter(smallest.max(), np.inf)))
+    for _ in progress(range(TOLERANCES - 2), desc=f"adaptive, {policy.label}"):
+        gaps = {(low, high): rows[low]["steps_mean"] - rows[high]["steps_mean"] for low, high in pairwise(sorted(rows))}
+        quantile = float(np.mean(max(gaps, key=gaps.get)))
+        try_out(quantile, float(np.quantile(smallest, quantile)))
+    return [rows[quantile] for quantile in sorted(rows)]
 
 
 def dynamics_rows(values: dict[str, dict[int, np.ndarray]]) -> Rows:
@@ -418,11 +461,16 @@ def dynamics_rows(values: dict[str, dict[int, np.ndarray]]) -> Rows:
     return rows
 
 
-def training_rows(policy: Policy, settling: Rows, r2: Rows, dynamics: Rows) -> Rows:
-    """e_k (mean over components), delta R^2 of the step to k (mean over late components), and the dynamics."""
-    values = [("settling_error", row["step"], row["error"]) for row in settling]
-    values += [("delta_r2", row["step_to"], row["delta_r2"]) for row in r2]
-    values += [(row["quantity"], row["step"], row["value"]) for row in dynamics]
+def training_rows(policy: Policy, obs: np.ndarray, proposals: np.ndarray, seed: int) -> Rows:
+    """e_k (mean over components), delta R^2 of the step to k (mean over late components), the dynamics, and under
+    k = K the return lost if f reads zero at every step, as in `feedback`."""
+    values = [("settling_error", row["step"], row["error"]) for row in settling_rows(proposals, policy.names)]
+    values += [("delta_r2", row["step_to"], row["delta_r2"]) for row, *_ in r2_rows(proposals, policy.names)]
+    rows = dynamics_rows(dynamics(policy, obs, proposals, seed))
+    values += [(row["quantity"], row["step"], row["value"]) for row in rows]
+    means = policy.mean(), policy.reading_zero()
+    own, zero = (final_returns(policy, mean, TRAINING_EPISODES)[0] for mean in means)
+    values.append(("return_lost_reading_zero", policy.args.refinement_depth, np.mean(own - zero)))
     means = {}
     for quantity, k, value in values:
         means.setdefault((quantity, k), []).append(value)
@@ -430,228 +478,193 @@ def training_rows(policy: Policy, settling: Rows, r2: Rows, dynamics: Rows) -> R
     return [run | {"quantity": quantity, "step": k, "value": np.mean(x)} for (quantity, k), x in means.items()]
 
 
-def analyse(policy: Policy, args: Args) -> dict[str, Rows]:
+def analyse(policy: Policy, args: Args) -> dict[str, pd.DataFrame]:
     """The tables of the sections, of one checkpoint."""
     obs, episodes = record_states(policy, args)
-    proposals = with_start(policy.agent.actor.proposals(layers(policy.agent.arrays(), "actor"), obs)).astype(float)
-    sections, names, tables = set(args.sections), policy.names, {}
-    if sections & {"settling", "training"}:
-        tables["settling_error"] = settling_rows(proposals, names)
-    if sections & {"r2", "training"}:
-        tables["delta_r2"] = r2_rows(proposals, names)
-    if "r2" in sections:
-        tables["delta_r2_checks"] = r2_check_rows(proposals, names, obs, episodes, args.seed)
-    if "anytime" in sections:
-        tables["anytime"] = anytime_rows(policy, args.episodes)
-    if "adaptive" in sections:
-        tables["adaptive"] = adaptive_rows(policy, correction_norms(proposals), args.episodes)
-    if sections & {"dynamics", "training"}:
-        tables["dynamics"] = dynamics_rows(dynamics(policy.agent, obs, proposals, args.seed))
-    if "training" in sections:
-        inputs = (tables[name] for name in ("settling_error", "delta_r2", "dynamics"))
-        tables["training"] = training_rows(policy, *inputs)
-    return {name: rows for name, rows in tables.items() if TABLES[name].section in sections and rows}
+    proposals, names = policy.proposals(obs).astype(float), policy.names
+    sections = {
+        "settling": lambda: {"settling_error": settling_rows(proposals, names)},
+        "r2": lambda: r2_tables(proposals, names, obs, episodes, args.seed),
+        "feedback": lambda: {"feedback": feedback_rows(policy, obs, proposals, args)},
+        "anytime": lambda: anytime_tables(policy, args.episodes),
+        "adaptive": lambda: {"adaptive": adaptive_rows(policy, correction_norms(proposals), args.episodes)},
+        "dynamics": lambda: {"dynamics": dynamics_rows(dynamics(policy, obs, proposals, args.seed))},
+        "training": lambda: {"training": training_rows(policy, obs, proposals, args.seed)},
+    }
+    tables, path = {}, {"checkpoint": str(policy.path)}
+    for section in set(args.sections):
+        for name, rows in sections[section]().items():
+            tables |= {name: pd.DataFrame([path | row for row in rows])} if rows else {}
+    return tables
 
 
 # --- Tables across checkpoints, and as text ---------------------------------------------------------------------------
 
-
-class Table(NamedTuple):
-    """Of a CSV: its section, the columns that name a row, and for printing the key that becomes columns of a value."""
-
-    section: Section
-    keys: tuple[str, ...]
-    spread: tuple[str, str] | None = None
-
-
-TABLES = {
-    "settling_error": Table("settling", ("component", "step"), ("step", "error")),
-    "delta_r2": Table("r2", ("component", "step_from", "step_to")),
-    "delta_r2_checks": Table("r2", ("component", "step_from", "step_to")),
-    "anytime": Table("anytime", ("steps",)),
-    "adaptive": Table("adaptive", ("quantile",)),
-    "dynamics": Table("dynamics", ("quantity", "step"), ("step", "value")),
-    "training": Table("training", ("quantity", "step", "global_step"), ("global_step", "value")),
+KEYS = {  # of every section's tables: the columns that name a row
+    "settling": {"settling_error": ["component", "step"]},
+    "r2": dict.fromkeys(("delta_r2", "delta_r2_checks"), ["component", "step_from", "step_to"]),
+    "feedback": {"feedback": ["reads"]},
+    "anytime": dict.fromkeys(("anytime", "anytime_scaled"), ["steps"]),
+    "adaptive": {"adaptive": ["quantile"]},
+    "dynamics": {"dynamics": ["quantity", "step"]},
+    "training": {"training": ["quantity", "step", "global_step"]},
 }
+WIDE = {"settling": ("step", "error"), "dynamics": ("step", "value"), "training": ("global_step", "value")}
 
 
-def differ_in_seed(policies: list[Policy]) -> bool:
-    """Whether there are several checkpoints, each of another training seed."""
-    return len({policy.args.seed for policy in policies}) == len(policies) > 1
+def pivot(table: pd.DataFrame, keys: list[str], column: str, value: str) -> pd.DataFrame:
+    """A column for every value of `column`, ascending, and a row for those of the other keys, as they appear."""
+    index = table[[key for key in keys if key != column]].astype(str).agg(" ".join, axis=1)
+    wide = table.assign(index=index).pivot(index="index", columns=column, values=value)
+    return wide.loc[index.unique()].rename_axis(index=None, columns=None)
 
 
-def grouped(rows: Rows, *keys: str) -> dict[tuple, Rows]:
-    """Rows by the values of `keys`, in the order of their first appearance."""
-    groups = {}
-    for row in rows:
-        groups.setdefault(tuple(row[key] for key in keys), []).append(row)
-    return groups
-
-
-def without(rows: Rows, *columns: str) -> Rows:
-    return [{name: value for name, value in row.items() if name not in columns} for row in rows]
-
-
-def pivot(rows: Rows, keys: tuple[str, ...], column: str, value: str) -> dict[str, dict]:
-    """{label of the other keys: {column: value}}."""
-    groups = grouped(rows, *(key for key in keys if key != column))
-    return {" ".join(map(str, key)): {row[column]: row[value] for row in group} for key, group in groups.items()}
-
-
-def across_seeds(rows: Rows, keys: tuple[str, ...]) -> Rows:
+def across_seeds(table: pd.DataFrame, keys: list[str]) -> pd.DataFrame:
     """Mean and standard deviation (ddof 1) over checkpoints of every value column, and how many they are."""
-    result = []
-    for key, group in grouped(without(rows, "checkpoint", "seed"), *keys).items():
-        statistics = {name: mean_and_std([row[name] for row in group]) for name in group[0] if name not in keys}
-        columns = {f"{name}_{what}": x for name, both in statistics.items() for what, x in zip(("mean", "std"), both)}
-        result.append(dict(zip(keys, key)) | {"seeds": len(group)} | columns)
-    return result
+    groups = table.drop(columns=["checkpoint", "seed"], errors="ignore").groupby(keys, sort=False)
+    mean, std = (lambda x, i=i: mean_and_std(x.to_numpy())[i] for i in (0, 1))  # of one checkpoint the std is 0
+    statistics = groups.agg([("mean", mean), ("std", std)])
+    statistics.columns = ["_".join(column) for column in statistics.columns]
+    statistics.insert(0, "seeds", groups.size())
+    return statistics.reset_index()
 
 
-def as_text(rows: Rows, table: Table) -> str:
+def as_text(rows: pd.DataFrame, section: str, keys: list[str]) -> str:
     """A table of aligned columns."""
-    if table.spread:
-        shown = pivot(rows, table.keys, *table.spread)
-        columns = sorted({column for row in shown.values() for column in row})
-    else:
-        shown = {" ".join(str(row[key]) for key in table.keys): row for row in rows}
-        columns = [column for column in rows[0] if column not in {*table.keys, "checkpoint"}]
-    lines = [["", *map(str, columns)]]
-    lines += [[label, *(f"{row[c]:.4g}" if c in row else "" for c in columns)] for label, row in shown.items()]
-    widths = [max(map(len, column)) for column in zip(*lines)]
-    return "\n".join("  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]) for line in lines)
+    narrow = rows.drop(columns="checkpoint").set_index(keys).rename_axis([None] * len(keys))
+    shown = pivot(rows, keys, *WIDE[section]) if section in WIDE else narrow
+    return shown.to_string(float_format="{:.4g}".format, na_rep="", sparsify=False)
 
 
-def as_csv(rows: Rows) -> bytes:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue().encode()
-
-
-def as_summary(rows: Rows, table: Table) -> dict | Rows:
+def as_summary(rows: pd.DataFrame, section: str, keys: list[str]) -> dict | Rows:
     """What one checkpoint's table comes to; of regressions the mean of every column over components and steps."""
-    if table.section == "r2":
-        values = without(rows, "checkpoint", *table.keys)
-        return {name: np.mean([row[name] for row in values]) for name in values[0]}
-    return pivot(rows, table.keys, *table.spread) if table.spread else without(rows, "checkpoint")
+    if section in WIDE:
+        return {label: row.dropna().to_dict() for label, row in pivot(rows, keys, *WIDE[section]).iterrows()}
+    values = rows.drop(columns="checkpoint")
+    if section == "r2":
+        return {name: np.mean(x.to_numpy()) for name, x in values.drop(columns=keys).items()}
+    return values.to_dict("records")
 
 
 # --- Figures ----------------------------------------------------------------------------------------------------------
 
-AROUND_ONE = ("correction_ratio", "largest_singular_value", "spectral_radius", "spread_of_random_starts")
+AROUND_ONE = ("correction ratio", "largest singular value", "spectral radius", "spread of random starts")
 PAST_K = {"uniform": "$c_k = 1$", "average": "$c_k = 1/K$", "inverse": "$c_k = 1/k$"}
 STYLE = {"font.size": 7, "axes.titlesize": 7, "figure.titlesize": 7.5, "axes.formatter.useoffset": False}
-LINE = {"markersize": 4, "linewidth": 1, "capsize": 2}
+STYLE["axes.formatter.limits"] = (-4, 5)  # long numbers in powers of ten
 MARKERS = "os^Dv<>P*X"
+BY_SEED = {
+    "return_lost_reading_zero": "return lost if $f$ reads zero",
+    "spectral_radius": "spectral radius (mean over $k$)",
+    "settling_error": "$e_1$ (mean over components)",
+    "delta_r2": r"$\Delta R^2$ (mean over components and $k$)",
+}
+
+
+def mean_with_bars(rows: pd.DataFrame, x: str, name: str, count: int = 1) -> pd.DataFrame:
+    """To be drawn: a mean over `count` values against a column x, with bars of its standard error."""
+    mean, error = rows[f"{name}_mean"], rows[f"{name}_std"] / count**0.5
+    return rows.assign(x=rows[x], y=mean, low=mean - error, high=mean + error)
 
 
 class Figures:
-    """Draws the tables; checkpoints of different seeds are averaged too, others (steps of a run) stand side by side."""
+    """Draws the tables: checkpoints side by side or a line each, and if they are seeds also their mean."""
 
-    def __init__(self, policies: list[Policy], episodes: int):
-        args = policies[0].args
+    def __init__(self, policies: list[Policy], args: Args, tables: dict[str, pd.DataFrame]):
         labels = [policy.label for policy in policies]
-        self.labels = {str(p.path): p.label if labels.count(p.label) == 1 else str(p.path) for p in policies}
-        self.single, self.seeds, self.episodes = len(policies) == 1, differ_in_seed(policies), episodes
-        self.depth, self.schedule = args.refinement_depth, args.refinement_schedule
-        self.title = f"{args.env_id}, $K = {self.depth}$, {self.schedule} schedule"
+        labels = {str(p.path): p.label if labels.count(p.label) == 1 else str(p.path) for p in policies}
+        self.tables = {name: rows.assign(line=rows["checkpoint"].map(labels)) for name, rows in tables.items()}
+        self.policies, self.episodes, self.depth = policies, args.episodes, policies[0].args.refinement_depth
+        self.single, self.seeds = (
+            len(policies) == 1,
+            len({policy.args.seed for policy in policies}) == len(policies) > 1,
+        )
+        self.schedule = policies[0].args.refinement_schedule
+        self.title = f"{policies[0].args.env_id}, $K = {self.depth}$, {self.schedule} schedule"
         self.title += f", {policies[0].label}" if self.single else ""
 
-    def axes(self, what: str, count: int, columns: int, width: float, height: float, **share) -> tuple[Figure, list]:
-        """A titled figure of `count` axes, at most `columns` in a row, each of width x height inches."""
-        rows = -(-count // columns)
-        columns = -(-count // rows)
+    def axes(self, what: str, titles: list[str], columns: int, width: float, height: float, **share):
+        """A titled figure and its titled axes, at most `columns` in a row, each of width x height inches."""
+        rows = -(-len(titles) // columns)
+        columns = -(-len(titles) // rows)
         figure = Figure((max(columns * width + 0.8, 3.8), rows * height + 0.6), layout="constrained", dpi=200)
         axes = figure.subplots(rows, columns, squeeze=False, **share).ravel().tolist()
-        for axis in axes[count:]:
+        for axis, title in zip(axes, titles):
+            axis.set_title(title)
+        for axis in axes[len(titles) :]:
             axis.remove()
         figure.suptitle(f"{what}\n{self.title}")
-        return figure, axes[:count]
+        return figure, axes[: len(titles)]
 
-    def heatmaps(self, what: str, rows: Rows, names: list[str], column: str, value: str, color: str, cell="{:.2f}"):
-        """Component by `column`, a panel per checkpoint (with seeds also mean and std), all on one colour scale."""
-        keys = ("component", column)
-        panels = {self.labels[path]: pivot(group, keys, column, value)
-                  for (path,), group in grouped(rows, "checkpoint").items()}  # fmt: skip
+    def heatmaps(self, what: str, label: str, rows: pd.DataFrame, names: list[str], value: str, text, width: float):
+        """Component by column `at`, a panel per checkpoint (with seeds also mean and std), all on one colour scale; a
+        cell says `text(value)`."""
+        keys = ["component", "at"]
+        panels = {line: pivot(group, keys, "at", value) for line, group in rows.groupby("line", sort=False)}
         if self.seeds:
-            across = across_seeds(rows, keys)
-            panels["mean over seeds"] = pivot(across, keys, column, f"{value}_mean")
-            panels["std over seeds"] = pivot([row for row in across if row["seeds"] > 1], keys, column, f"{value}_std")
-        columns = list(dict.fromkeys(row[column] for row in rows))
-        norm = Normalize(min(0.0, *(row[value] for row in rows)), max(row[value] for row in rows))
-        width, height = 0.34 * len(columns) + 0.2, 0.17 * len(names) + 0.6
-        figure, axes = self.axes(what, len(panels), max(1, int(8 / width)), width, height, sharey=True)
-        for axis, (title, panel) in zip(axes, panels.items()):
-            matrix = np.array([[panel.get(name, {}).get(c, np.nan) for c in columns] for name in names])
+            across = across_seeds(rows[["checkpoint", *keys, value]], keys)
+            panels["mean over seeds"] = pivot(across, keys, "at", f"{value}_mean")
+            panels["std over seeds"] = pivot(across[across["seeds"] > 1], keys, "at", f"{value}_std")
+        columns, norm = rows["at"].unique(), Normalize(min(0.0, rows[value].min()), rows[value].max())
+        width, height, titles = width * len(columns) + 0.2, 0.17 * len(names) + 0.6, [""] if self.single else panels
+        figure, axes = self.axes(what, titles, max(1, int(8 / width)), width, height, sharey=True)
+        for axis, panel in zip(axes, panels.values()):
+            matrix = panel.reindex(index=names, columns=columns).to_numpy()
             image = axis.imshow(matrix, cmap="cividis_r", norm=norm, aspect="auto")
             for (i, j), x in np.ndenumerate(matrix):
-                text = "" if np.isnan(x) else cell.format(x)
-                axis.text(j, i, text, color="white" if norm(x) > 0.5 else "black", ha="center", va="center", size=6)
+                color = "white" if norm(x) > 0.5 else "black"
+                axis.text(j, i, "" if np.isnan(x) else text(x), color=color, ha="center", va="center", size=6)
             axis.set_xticks(range(len(columns)), columns)
             axis.set_yticks(range(len(names)), names)
-            axis.set(xlabel=f"refinement {column}", title="" if self.single else title)
-        figure.colorbar(image, ax=axes, label=color)
+            axis.set_xlabel("refinement step")
+        figure.colorbar(image, ax=axes, label=label)
         return figure
 
-    def curve(self, axis, rows: Rows, x: str, y: str, interval=None, label=None, **style):
-        """y against x, with error bars to `interval(row)`; of seeds each one in grey, and their mean +- std."""
-        groups = grouped(rows, "checkpoint")
-        for i, ((path,), group) in enumerate(groups.items()):
-            xs, ys = ([row[name] for row in group] for name in (x, y))
-            error = np.abs(np.array([interval(row) for row in group]).T - ys) if interval and not self.seeds else None
-            look = {"color": "0.7"} if self.seeds else {
-                "color": colormaps["cividis"](0.85 * i / len(groups)), "marker": MARKERS[i % len(MARKERS)],
-                "label": label if self.single else self.labels[path]}  # fmt: skip
-            axis.errorbar(xs, ys, error, **LINE | look | style)
-        if self.seeds:
-            xs, ys = (np.array([[row[name] for row in group] for group in groups.values()]) for name in (x, y))
-            look = {"color": "black", "marker": "o", "label": label}
-            axis.errorbar(xs.mean(0), ys.mean(0), ys.std(0, ddof=1), **LINE | look | style)
+    def lines(self, what: str, panels: dict[str, pd.DataFrame], columns: int, width: float, height: float, **labels):
+        """`y` against `x` for every `line`, with bars from `low` to `high`, a panel per table, all with these labels;
+        with seeds also their mean, where they have the same x."""
+        figure, axes = self.axes(what, panels, columns, width, height)
+        names = pd.concat(panels.values())["line"].unique().tolist()
+        for axis, rows in zip(axes, panels.values()):
+            for name, line in rows.groupby("line", sort=False):
+                i = names.index(name)
+                look = {"color": colormaps["cividis"](0.85 * i / len(names)), "marker": MARKERS[i % len(MARKERS)]}
+                look |= {"linestyle": "none" if "points" in rows else "-", "markersize": 4, "linewidth": 1}
+                error = [line["y"] - line["low"], line["high"] - line["y"]] if "low" in rows else None
+                axis.errorbar(line["x"], line["y"], error, label=name, capsize=2, **look)
+            if self.seeds and "points" not in rows:
+                mean = rows.groupby("x", sort=False)["y"].mean()
+                axis.plot(mean.index, mean, "k--", linewidth=1.5, label="mean over seeds")
+            axis.set(**labels)
+        return figure, axes
 
-    def returns(self, axis, rows: Rows, x: str, label: str | None = None):
-        """Return against x; the error bars are standard errors over episodes, or with seeds their std."""
-
-        def interval(row: dict) -> tuple[float, float]:
-            half = row["return_std"] / self.episodes**0.5
-            return row["return_mean"] - half, row["return_mean"] + half
-
-        self.curve(axis, rows, x, "return_mean", interval, label)
-        spread = "std over seeds" if self.seeds else f"standard error of {self.episodes} episodes"
-        axis.set_ylabel(f"return (mean, {spread})")
-
-    def legend(self, figure: Figure, axis):
-        """One legend below all axes."""
-        handles, labels = axis.get_legend_handles_labels()
-        if len(labels) > 1:
-            columns = int(figure.get_figwidth() / 1.3)
-            figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
-
-    def settling(self, tables: dict[str, Rows]) -> dict[str, Figure]:
+    def settling(self) -> dict[str, Figure]:
         """Figure 3a, with a row for a correction that never changes, so that m_k only grows with the schedule."""
-        rows, constant = tables["settling_error"], "(constant $f$)"
-        done = np.cumsum([0, *refineppo.refinement_coefficients(self.schedule, self.depth)])
-        error = pivot(across_seeds(rows, ("component", "step")), ("component", "step"), "step", "error_mean")
-        names = [*sorted(error, key=lambda name: error[name][1]), constant]
-        rows = without(rows, "rank")
-        rows += [{"checkpoint": path, "component": constant, "step": k, "error": 1 - c / done[-1]}
-                 for path in self.labels for k, c in enumerate(done)]  # fmt: skip
-        what, color = "Remaining refinement by action component", "$e_{k,j}$ (dark: far from its end)"
-        return {"settling_error": self.heatmaps(what, rows, names, "step", "error", color)}
+        rows, constant = self.tables["settling_error"].rename(columns={"step": "at"}), "(constant $f$)"
+        done = np.cumsum([0, *self.policies[0].coefficients])
+        names = rows[rows["at"] == 1].groupby("component", sort=False)["error"].mean().sort_values(kind="stable").index
+        steps = pd.DataFrame({"component": constant, "at": range(len(done)), "error": 1 - done / done[-1]})
+        checkpoints = rows[["checkpoint", "line"]].drop_duplicates()
+        rows = pd.concat([rows, checkpoints.merge(steps, how="cross")])
+        what, label = "Remaining refinement by action component", "$e_{k,j}$ (dark: far from its end)"
+        heatmap = self.heatmaps(what, label, rows, [*names, constant], "error", "{:.2f}".format, width=0.34)
+        return {"settling_error": heatmap}
 
-    def r2(self, tables: dict[str, Rows]) -> dict[str, Figure]:
+    def r2(self) -> dict[str, Figure]:
         """Figure 3b, and its numbers beside the three checks."""
-        rows = [row | {"transition": f"{row['step_from']}→{row['step_to']}"} for row in tables["delta_r2"]]
-        names = list(dict.fromkeys(row["component"] for row in rows))
-        what = "What early components add to the prediction of late corrections"
-        color = r"$\Delta R^2$ (dark: large)"
-        heatmap = self.heatmaps(what, rows, names, "transition", "delta_r2", color, "{:.3f}")
-        panels = grouped(tables["delta_r2_checks"], "checkpoint", "step_from")
+        rows, checks = self.tables["delta_r2"], self.tables["delta_r2_checks"]
+        rows, checks = (
+            x.assign(at=x["step_from"].astype(str) + "→" + x["step_to"].astype(str)) for x in (rows, checks)
+        )
+        what, label = "What early components add to the prediction of late corrections", r"$\Delta R^2$ (dark: large)"
+        names = rows["component"].unique().tolist()
+        heatmap = self.heatmaps(what, label, rows, names, "delta_r2", "{:.2g}".format, width=0.48)
+        title = checks["at"] if self.single else checks["line"] + "\n" + checks["at"]
+        panels = dict(list(checks.groupby(title, sort=False)))
         columns, height = min(4, self.depth - 1), 0.15 * max(map(len, panels.values())) + 0.9
-        figure, axes = self.axes(r"$\Delta R^2$ and three checks", len(panels), columns, 1.8, height, sharex=True)
-        for axis, ((path, k), group) in zip(axes, panels.items()):
-            x, y = {name: [row[name] for row in group] for name in group[0]}, np.arange(len(group))
+        figure, axes = self.axes(r"$\Delta R^2$ and three checks", panels, columns, 1.8, height, sharex=True)
+        for axis, x in zip(axes, panels.values()):
+            y = np.arange(len(x))
             axis.axvline(0, color="0.6", linewidth=0.7)
             axis.hlines(y, x["shuffled_low"], x["shuffled_high"], "0.75", linewidth=6, label="shuffled (95 %)")
             axis.plot(x["delta_r2"], y, "ko", markersize=3.5, label="the paper's")
@@ -660,61 +673,88 @@ class Figures:
             axis.set_yticks(y, x["component"])
             axis.set(ylim=(len(y) - 0.5, -0.5), xlabel=r"$\Delta R^2$")
             axis.locator_params(axis="x", nbins=3)
-            axis.set_title(f"{k}→{k + 1}" if self.single else f"{self.labels[path]}\n{k}→{k + 1}")
-        self.legend(figure, axes[0])
         return {"delta_r2": heatmap, "delta_r2_checks": figure}
 
-    def anytime(self, tables: dict[str, Rows]) -> dict[str, Figure]:
-        figure, (axis,) = self.axes("Return of the policy stopped after $k$ steps", 1, 1, 3.4, 2.2)
-        self.returns(axis, tables["anytime"], "steps")
-        axis.axvline(self.depth, color="0.5", linestyle=":")
-        axis.set_xlabel(f"steps $k$ (dotted: $K$; past it {PAST_K[self.schedule]})")
-        self.legend(figure, axis)
+    def feedback(self) -> dict[str, Figure]:
+        rows = self.tables["feedback"].assign(points=True)
+        rows["reads"] = rows["reads"].str.replace("_", "\n")
+        panels = {
+            f"return ({FEEDBACK_EPISODES} episodes)": mean_with_bars(rows, "reads", "return", FEEDBACK_EPISODES),
+            "return lost, paired by episode": mean_with_bars(rows, "reads", "lost", FEEDBACK_EPISODES),
+            "$R^2$ of $m_K$ in recorded states": rows.rename(columns={"reads": "x", "r2": "y"}),
+        }
+        what = "What $f$ reads in place of $m_k$ (mean and standard error)"
+        figure, _ = self.lines(what, panels, 3, 2.0, 1.9, xmargin=0.15)
+        return {"feedback": figure}
+
+    def anytime(self) -> dict[str, Figure]:
+        names = {"acting with $m_k$": "anytime", "acting with $(K/k) m_k$": "anytime_scaled"}
+        panels = {title: mean_with_bars(self.tables[x], "steps", "return", self.episodes) for title, x in names.items()}
+        label = f"steps $k$ (dotted: $K$; past it {PAST_K[self.schedule]})"
+        what = f"Return of the policy stopped after $k$ steps (mean and standard error, {self.episodes} episodes)"
+        figure, axes = self.lines(what, panels, 2, 2.6, 2.1, xlabel=label)
+        low, high = zip(*(axis.get_ylim() for axis in axes))
+        for axis in axes:
+            axis.axvline(self.depth, color="0.5", linestyle=":")
+            axis.set_ylim(min(low), max(high))
         return {"anytime": figure}
 
-    def adaptive(self, tables: dict[str, Rows]) -> dict[str, Figure]:
-        figure, (axis,) = self.axes("Return if refinement stops at a small correction", 1, 1, 3.4, 2.4)
-        self.returns(axis, tables["adaptive"], "steps_mean", "stopped below a tolerance")
-        fixed = [row for row in tables.get("anytime", []) if 1 <= row["steps"] <= self.depth]
-        if fixed and (self.single or self.seeds):
-            look = {"label": "the same number in every state", "linestyle": ":", "fillstyle": "none"}
-            self.curve(axis, fixed, "steps", "return_mean", **look)
-        tolerance = max(row["tolerance"] for row in tables["adaptive"])
-        axis.set_xlabel(f"mean steps used (tolerance from 0 at $K$ to {tolerance:.2g} on the left)")
-        self.legend(figure, axis)
+    def adaptive(self) -> dict[str, Figure]:
+        """Points without lines: what lies between two tolerances was not measured."""
+        rows = mean_with_bars(self.tables["adaptive"], "steps_mean", "return", self.episodes).assign(points=True)
+        label = f"mean steps used (tolerance from 0 at $K$ to {rows['tolerance'].max():.2g} on the left)"
+        labels = {"xlabel": label, "ylabel": f"return (mean, standard error, {self.episodes} episodes)"}
+        figure, (axis,) = self.lines(
+            "Return if refinement stops at a small correction", {"": rows}, 1, 3.6, 2.4, **labels
+        )
+        if "anytime" in self.tables and (self.single or self.seeds):
+            fixed = self.tables["anytime"].groupby("steps")["return_mean"].mean().loc[1 : self.depth]
+            axis.plot(fixed.index, fixed, "kx", label="the same number of steps in every state")
         return {"adaptive": figure}
 
-    def dynamics(self, tables: dict[str, Rows]) -> dict[str, Figure]:
-        quantities = grouped(tables["dynamics"], "quantity")
-        spread = "mean and std over seeds of the medians" if self.seeds else "median and 10 to 90 % of states"
-        figure, axes = self.axes(f"Dynamics of the refinement ({spread})", len(quantities), 4, 1.65, 1.5)
-        for axis, ((quantity,), rows) in zip(axes, quantities.items()):
-            fraction = "outside" in quantity
-            self.curve(axis, rows, "step", "value", None if fraction else lambda row: (row["q10"], row["q90"]))
+    def dynamics(self) -> dict[str, Figure]:
+        columns = {"step": "x", "value": "y", "q10": "low", "q90": "high"}
+        rows = self.tables["dynamics"].rename(columns=columns)
+        panels = dict(list(rows.groupby(rows["quantity"].str.replace("_", " "), sort=False)))
+        panels = {name: x.drop(columns=["low", "high"]) if "outside" in name else x for name, x in panels.items()}
+        what, limits = "Dynamics of the refinement (median and 10 to 90 % of states)", (-0.3, self.depth + 0.3)
+        figure, axes = self.lines(what, panels, 4, 1.65, 1.5, xlabel="step $k$", xlim=limits)
+        for axis, quantity in zip(axes, panels):
             if quantity in AROUND_ONE:
                 axis.axhline(1, color="0.5", linestyle=":")
-            axis.set(title=quantity.replace("_", " "), xlabel="step $k$", xlim=(-0.3, self.depth + 0.3))
-            if fraction:
+            if "outside" in quantity:
                 axis.set(ylabel="fraction", ylim=(-0.05, 1.05))
-        self.legend(figure, axes[0])
         return {"dynamics": figure}
 
-    def training(self, tables: dict[str, Rows]) -> dict[str, Figure]:
-        quantities, seeds = grouped(tables["training"], "quantity"), len(grouped(tables["training"], "seed")) > 1
-        what = "Refinement through training" + " (mean and std over seeds)" * seeds
-        figure, axes = self.axes(what, len(quantities), 3, 2.0, 1.4)
-        for axis, ((quantity,), rows) in zip(axes, quantities.items()):
-            for (k,), of_step in grouped(rows, "step").items():
-                points = sorted(across_seeds(of_step, TABLES["training"].keys), key=lambda point: point["global_step"])
-                x, y, std = zip(*((p["global_step"], p["value_mean"], p["value_std"]) for p in points))
-                axis.errorbar(x, y, std if seeds else None, label=f"$k = {k}$", marker=MARKERS[k % len(MARKERS)],
-                              color=colormaps["cividis"](0.85 * k / self.depth), **LINE)  # fmt: skip
-            axis.set(title=quantity.replace("_", " "), xlabel="training step")
-        self.legend(figure, axes[0])
-        return {"training": figure}
+    def training(self) -> dict[str, Figure]:
+        """Every quantity, a line per step k, averaged over seeds; and what says when refinement begins, a line per
+        seed, beside the learning curve."""
+        table, what = self.tables["training"], "Refinement through training"
+        average = across_seeds(table.drop(columns="line"), KEYS["training"]["training"]).sort_values("global_step")
+        average["line"] = "$k = " + average["step"].astype(str) + "$"
+        average = mean_with_bars(average, "global_step", "value")
+        panels = dict(list(average.groupby(average["quantity"].str.replace("_", " "), sort=False)))
+        by_step, _ = self.lines(f"{what} (mean and std over seeds)", panels, 3, 2.0, 1.4, xlabel="training step")
+
+        files = {policy.path.with_name("evaluations.csv"): policy.args.seed for policy in self.policies}
+        curves = [pd.read_csv(path).assign(seed=seed) for path, seed in files.items() if path.exists()]
+        curves = [curve.assign(quantity="evaluation return", value=curve["return_mean"]) for curve in curves]
+        chosen = table["quantity"].isin(BY_SEED) & ((table["step"] == 1) | (table["quantity"] != "settling_error"))
+        rows = pd.concat([*curves, table[chosen].replace({"quantity": BY_SEED})])
+        rows = rows.groupby(["quantity", "seed", "global_step"], sort=False)["value"].mean().reset_index()
+        rows = rows.rename(columns={"global_step": "x", "value": "y"}).assign(line="seed " + rows["seed"].astype(str))
+        panels = dict(list(rows.groupby("quantity", sort=False)))
+        by_seed, _ = self.lines(f"{what}, a line per seed", panels, 3, 2.4, 1.5, xlabel="training step")
+        return {"training": by_step, "training_by_seed": by_seed}
 
 
 def as_png(figure: Figure) -> bytes:
+    """The picture, with one legend below all axes."""
+    lines = [axis.get_legend_handles_labels() for axis in figure.axes]
+    legend = {label: handle for handles, labels in lines for handle, label in zip(handles, labels)}
+    if len(legend) > 1:
+        columns = max(1, int(figure.get_figwidth() / (0.6 + 0.05 * max(map(len, legend)))))
+        figure.legend(legend.values(), legend, loc="outside lower center", ncols=columns, frameon=False)
     image = io.BytesIO()
     figure.savefig(image, format="png")
     return image.getvalue()
@@ -726,29 +766,33 @@ def as_png(figure: Figure) -> bytes:
 def main():
     args = tyro.cli(Args, description=__doc__)
     policies = check(args)
-    refineppo.limit_threads(policies[0].args)  # as in the run, for the same returns
-    several, tables = len(policies) > 1, {}
-    for policy in tqdm(policies, desc="checkpoints", disable=None if several else True):
-        for name, rows in analyse(policy, args).items():
-            tables.setdefault(name, []).extend({"checkpoint": str(policy.path)} | row for row in rows)
+    torch.set_num_threads(policies[0].args.num_threads)  # as in the run, for the same returns
+    threadpool_limits(policies[0].args.num_threads)
+    several = len(policies) > 1
+    parts = [analyse(policy, args) for policy in tqdm(policies, desc="checkpoints", disable=None if several else True)]
+    tables = {name: pd.concat([part[name] for part in parts], ignore_index=True) for name in parts[0]}
 
+    files, figures = {}, Figures(policies, args, tables)
     facts = ("env_id", "seed", "refinement_depth", "refinement_schedule")
-    files, summary = {}, {"flags": asdict(args), "checkpoints": {
-        str(policy.path): {"global_step": policy.global_step} | {name: getattr(policy.args, name) for name in facts}
-        for policy in policies}}  # fmt: skip
-    for name, rows in tables.items():
-        table = TABLES[name]
-        for (path,), group in grouped(rows, "checkpoint").items():
-            summary.setdefault(table.section, {}).setdefault(path, {})[name] = as_summary(group, table)
-        for (whose,), group in grouped(rows, "seed" if name == "training" else "checkpoint").items():
-            print(f"\n{name}{f' of {whose}' if several else ''}\n{as_text(group, table)}")
-        files[f"{name}.csv"] = as_csv(rows if several else without(rows, "checkpoint"))
-        if differ_in_seed(policies) or name == "training" and len(grouped(rows, "seed")) > 1:
-            files[f"{name}_across_seeds.csv"] = as_csv(across_seeds(rows, table.keys))
-    with rc_context(STYLE):
-        figures = Figures(policies, args.episodes)
-        for section in dict.fromkeys(TABLES[name].section for name in tables):
-            files |= {f"{name}.png": as_png(figure) for name, figure in getattr(figures, section)(tables).items()}
+    facts = {str(p.path): {"global_step": p.global_step} | {x: getattr(p.args, x) for x in facts} for p in policies}
+    summary = {"flags": asdict(args), "checkpoints": facts}
+    for section, keys_of in KEYS.items():
+        for name, keys in keys_of.items():
+            if name not in tables:
+                continue
+            rows = tables[name]
+            for path, group in rows.groupby("checkpoint", sort=False):
+                summary.setdefault(section, {}).setdefault(path, {})[name] = as_summary(group, section, keys)
+            for whose, group in rows.groupby("seed" if section == "training" else "checkpoint", sort=False):
+                print(f"\n{name}{f' of {whose}' if several else ''}\n{as_text(group, section, keys)}")
+            rows = rows if several else rows.drop(columns="checkpoint")
+            files[f"{name}.csv"] = rows
+            if figures.seeds or section == "training" and rows["seed"].nunique() > 1:
+                files[f"{name}_across_seeds.csv"] = across_seeds(rows, keys)
+    files = {name: table.to_csv(index=False, lineterminator="\n").encode() for name, table in files.items()}
+    for section in set(args.sections) & summary.keys():
+        with rc_context(STYLE):
+            files |= {f"{name}.png": as_png(figure) for name, figure in getattr(figures, section)().items()}
     files["summary.json"] = json.dumps(summary, indent=2, default=str).encode()
     try:
         for name, data in files.items():
@@ -757,6 +801,11 @@ def main():
         refuse(f"cannot write to the output folder {args.folder}: {error.strerror}")
     if len(policies[0].names) == 1 and {"r2", "training"} & set(args.sections):
         print("\nan action has one component, which no other can inform: there is no delta R^2")
+    for path, rows in tables["adaptive"].groupby("checkpoint", sort=False) if "adaptive" in tables else ():
+        steps = np.sort(rows["steps_mean"])
+        low, high = steps[np.diff(steps).argmax() :][:2]
+        if high - low > (steps[-1] - steps[0]) / 2:
+            print(f"\n{path}: no tolerance was found that takes between {low:.2f} and {high:.2f} steps on average")
     print(f"\nthe tables, figures and summary.json are in {args.folder}")
 
 

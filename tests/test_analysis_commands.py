@@ -23,28 +23,39 @@ COLUMNS = {
     "delta_r2": "component,step_from,step_to,r2_baseline,r2_augmented,delta_r2",
     "delta_r2_checks": "component,step_from,step_to,delta_r2,shuffled_low,shuffled_high,above_shuffled,by_episode,"
     "given_observation",
+    "feedback": "reads,return_mean,return_std,length_mean,lost_mean,lost_std,r2",
     "anytime": "steps,return_mean,return_std,length_mean",
+    "anytime_scaled": "steps,return_mean,return_std,length_mean",
     "adaptive": "quantile,tolerance,steps_mean,return_mean,return_std,length_mean",
     "dynamics": "quantity,step,value,q10,q90",
     "training": "seed,global_step,quantity,step,value",
 }
-TABLES_OF = {"settling": ["settling_error"], "r2": ["delta_r2", "delta_r2_checks"]}
+FIGURES = set(COLUMNS) - {"anytime_scaled"} | {"training_by_seed"}
+FILES = {
+    "settling": ["settling_error"],
+    "r2": ["delta_r2", "delta_r2_checks"],
+    "anytime": ["anytime", "anytime_scaled"],
+}
+SECTIONS = ("settling", "r2", "feedback", "anytime", "adaptive", "dynamics")
 
 
-def save(path: Path, env_id="Reacher-v5", step=2048, script=refineppo, **flags) -> Path:
+def save(path: Path, env_id="Reacher-v5", step=2048, **flags) -> Path:
     """A checkpoint as the training script writes it, of a policy whose f depends on m."""
-    args = script.Args(env_id=env_id, actor_hidden=(16, 16), **flags)
-    agent = script.Agent(*script.check_args(args), args)
+    args = refineppo.Args(env_id=env_id, actor_hidden=(16, 16), **flags)
+    env = gym.make(env_id)
+    agent = refineppo.Agent(env.observation_space, env.action_space, args)
     agent.params["actor.2.weight"].mul_(50)
     path.parent.mkdir(parents=True, exist_ok=True)
-    script.save_checkpoint(path, {"args": asdict(args), "global_step": step, **agent.tensors()})
+    refineppo.save_checkpoint(path, {"args": asdict(args), "global_step": step, **agent.state()})
     return path
 
 
 @pytest.fixture
 def analyse(monkeypatch):
-    """`python analysis_refinement.py FLAGS`, in this process; with few shuffles, whose fits take most of the time."""
-    monkeypatch.setattr(analysis, "SHUFFLES", 4)
+    """`python analysis_refinement.py FLAGS`, in this process; with few shuffles, fitted states and episodes."""
+    small = {"SHUFFLES": 4, "FIT_STATES": 200, "FEEDBACK_EPISODES": 2, "TRAINING_EPISODES": 2, "TOLERANCES": 3}
+    for name, value in small.items():
+        monkeypatch.setattr(analysis, name, value)
 
     def call(*flags):
         monkeypatch.setattr(sys, "argv", ["analysis_refinement.py", *map(str, flags)])
@@ -62,6 +73,15 @@ def header(path: Path) -> str:
     return path.read_text().splitlines()[0]
 
 
+def written(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def files(*tables: str) -> set[str]:
+    """What a command writes of these tables: each its CSV and its figure, if it has one of its own."""
+    return {f"{name}.csv" for name in tables} | {f"{name}.png" for name in FIGURES & set(tables)} | {"summary.json"}
+
+
 def assert_shows_something(path: Path):
     """The picture opens, and neither is of one colour nor a dot on an empty page."""
     pixels = matplotlib.image.imread(path)[..., :3]
@@ -73,9 +93,7 @@ def assert_shows_something(path: Path):
 def test_the_papers_two_analyses_are_the_default(tmp_path, analyse, capsys):
     analyse("--checkpoint", save(tmp_path / "best.pt"), "--num-states", 40)
     out = tmp_path / "analysis"
-    assert sorted(path.name for path in out.iterdir()) == [
-        "delta_r2.csv", "delta_r2.png", "delta_r2_checks.csv", "delta_r2_checks.png", "settling_error.csv",
-        "settling_error.png", "summary.json"]  # fmt: skip
+    assert written(out) == files("settling_error", "delta_r2", "delta_r2_checks")
     for name in ("settling_error", "delta_r2", "delta_r2_checks"):
         assert header(out / f"{name}.csv") == COLUMNS[name]
         assert_shows_something(out / f"{name}.png")
@@ -86,13 +104,21 @@ def test_the_papers_two_analyses_are_the_default(tmp_path, analyse, capsys):
     late = rows[-1]["component"]
     rows = read(out / "delta_r2.csv")
     assert [(row["component"], row["step_from"], row["step_to"]) for row in rows] == [
-        (late, "1", "2"), (late, "2", "3"), (late, "3", "4")]  # fmt: skip
+        (late, "1", "2"),
+        (late, "2", "3"),
+        (late, "3", "4"),
+    ]
     for row in rows:
         assert float(row["delta_r2"]) == float(row["r2_augmented"]) - float(row["r2_baseline"])
     summary = json.loads((out / "summary.json").read_text())
     path = str(tmp_path / "best.pt")
-    assert summary["checkpoints"][path] == {"global_step": 2048, "env_id": "Reacher-v5", "seed": 1,
-                                            "refinement_depth": 4, "refinement_schedule": "average"}  # fmt: skip
+    assert summary["checkpoints"][path] == {
+        "global_step": 2048,
+        "env_id": "Reacher-v5",
+        "seed": 1,
+        "refinement_depth": 4,
+        "refinement_schedule": "average",
+    }
     assert summary["settling"][path]["settling_error"][late]["4"] == 0
     mean = np.mean([float(row["delta_r2"]) for row in rows])
     assert summary["r2"][path]["delta_r2"]["delta_r2"] == pytest.approx(mean)
@@ -100,18 +126,23 @@ def test_the_papers_two_analyses_are_the_default(tmp_path, analyse, capsys):
     assert late in printed and str(out) in printed
 
 
-def test_every_section_of_seventeen_actions(tmp_path, analyse):
+def test_every_section_of_seventeen_actions(tmp_path, analyse, capsys):
     """HumanoidStandup-v5 with short episodes: five early and five late components, all named after their joints."""
     gym.register("ShortStandup-v0", "gymnasium.envs.mujoco.humanoidstandup_v5:HumanoidStandupEnv", max_episode_steps=8)
     path = save(tmp_path / "best.pt", "ShortStandup-v0", refinement_schedule="inverse", refinement_depth=3)
-    sections = ("settling", "r2", "anytime", "adaptive", "dynamics")
-    analyse("--checkpoint", path, "--num-states", 80, "--episodes", 2, "--out-dir", tmp_path / "out",
-            "--sections", *sections)  # fmt: skip
-    for name, columns in COLUMNS.items():
-        if name != "training":
-            assert header(tmp_path / f"out/{name}.csv") == columns
-            assert_shows_something(tmp_path / f"out/{name}.png")
-    assert set(json.loads((tmp_path / "out/summary.json").read_text())) == {"flags", "checkpoints", *sections}
+    flags = "--num-states", 80, "--episodes", 2, "--out-dir", tmp_path / "out"
+    analyse("--checkpoint", path, *flags, "--sections", *SECTIONS)
+    for name in set(COLUMNS) - {"training"}:
+        assert header(tmp_path / f"out/{name}.csv") == COLUMNS[name]
+    for name in FIGURES - {"training", "training_by_seed"}:
+        assert_shows_something(tmp_path / f"out/{name}.png")
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    assert set(summary) == {"flags", "checkpoints", *SECTIONS}
+    written = summary["feedback"][str(path)]["feedback"]
+    assert [row["reads"] for row in written] == ["own", "zero", "another_state", "one_pass"]
+    assert [str(row["lost_mean"]) for row in written] == [r["lost_mean"] for r in read(tmp_path / "out/feedback.csv")]
+    printed = capsys.readouterr().out
+    assert "another_state" in printed and "anytime_scaled" in printed
     rows = read(tmp_path / "out/settling_error.csv")
     assert len(rows) == 17 * 4
     ordered = list(dict.fromkeys(row["component"] for row in rows))
@@ -121,28 +152,37 @@ def test_every_section_of_seventeen_actions(tmp_path, analyse):
     assert [row["steps"] for row in read(tmp_path / "out/anytime.csv")] == [str(k) for k in range(7)]
 
 
-@pytest.mark.parametrize("section", ["settling", "r2", "anytime", "adaptive", "dynamics"])
+@pytest.mark.parametrize("section", SECTIONS)
 def test_a_section_alone(section, tmp_path, analyse):
     flags = "--sections", section, "--num-states", 20, "--episodes", 2
     analyse("--checkpoint", save(tmp_path / "best.pt"), *flags)
-    names = TABLES_OF.get(section, [section])
-    files = sorted([f"{name}.{kind}" for name in names for kind in ("csv", "png")] + ["summary.json"])
-    assert sorted(path.name for path in (tmp_path / "analysis").iterdir()) == files
+    assert written(tmp_path / "analysis") == files(*FILES.get(section, [section]))
     assert set(json.loads((tmp_path / "analysis/summary.json").read_text())) == {"flags", "checkpoints", section}
 
 
 def test_the_same_command_gives_the_same_tables(tmp_path, analyse):
     path = save(tmp_path / "best.pt")
     for out in ("a", "b"):
-        analyse("--checkpoint", path, "--num-states", 30, "--out-dir", tmp_path / out, "--sections", "r2", "dynamics")
-    for name in ("delta_r2", "delta_r2_checks", "dynamics"):
+        analyse(
+            "--checkpoint",
+            path,
+            "--num-states",
+            30,
+            "--out-dir",
+            tmp_path / out,
+            "--sections",
+            "r2",
+            "dynamics",
+            "feedback",
+        )
+    for name in ("delta_r2", "delta_r2_checks", "dynamics", "feedback"):
         assert (tmp_path / f"a/{name}.csv").read_bytes() == (tmp_path / f"b/{name}.csv").read_bytes()
 
 
 def test_seeds_of_one_setting(tmp_path, analyse):
     """Each seed's own rows as if analysed alone, and beside them the mean and standard deviation across seeds."""
     paths = [save(tmp_path / f"seed-{seed}/best.pt", seed=seed) for seed in (1, 2, 3)]
-    sections = "--num-states", 30, "--episodes", 2, "--sections", "settling", "r2", "anytime", "adaptive", "dynamics"
+    sections = "--num-states", 30, "--episodes", 2, "--sections", *SECTIONS
     analyse("--checkpoint", *paths, *sections)
     analyse("--checkpoint", paths[1], *sections)
     out, alone = tmp_path / "seed-1/analysis", tmp_path / "seed-2/analysis"
@@ -151,6 +191,7 @@ def test_seeds_of_one_setting(tmp_path, analyse):
         own = [row for row in read(out / f"{name}.csv") if row.pop("checkpoint") == str(paths[1])]
         assert own == read(alone / f"{name}.csv")
         assert not (alone / f"{name}_across_seeds.csv").exists()
+    for name in FIGURES - {"training", "training_by_seed"}:
         assert_shows_something(out / f"{name}.png")
     rows = read(out / "settling_error.csv")
     across = read(out / "settling_error_across_seeds.csv")
@@ -164,14 +205,16 @@ def test_seeds_of_one_setting(tmp_path, analyse):
 
 
 def test_a_run_through_training(tmp_path, analyse):
-    """Two seeds at two steps each: their own rows, and mean and std over the seeds at every training step."""
+    """Two seeds at two steps each: their own rows, and mean and std over the seeds at every training step. The return
+    lost is that of the section `feedback`."""
     paths = [save(tmp_path / f"{seed}/step_{step}.pt", seed=seed, step=step) for seed in (1, 2) for step in (100, 200)]
-    analyse("--checkpoint", *paths, "--num-states", 20, "--sections", "training", "settling")
+    analyse("--checkpoint", *paths, "--num-states", 20, "--sections", "training", "settling", "feedback")
     out = tmp_path / "1/analysis"
-    assert sorted(path.name for path in out.iterdir()) == [
-        "settling_error.csv", "settling_error.png", "summary.json", "training.csv", "training.png",
-        "training_across_seeds.csv"]  # fmt: skip
-    assert_shows_something(out / "training.png")
+    across = {"training_by_seed.png", "training_across_seeds.csv"}
+    assert written(out) == files("feedback", "settling_error", "training") | across
+    for name in ("training", "training_by_seed"):
+        assert_shows_something(out / f"{name}.png")
+    lost = {r["checkpoint"]: r["lost_mean"] for r in read(out / "feedback.csv") if r["reads"] == "zero"}
     rows = read(out / "training.csv")
     assert header(out / "training.csv") == "checkpoint," + COLUMNS["training"]
     for path, (seed, step) in zip(paths, [("1", "100"), ("1", "200"), ("2", "100"), ("2", "200")]):
@@ -182,6 +225,7 @@ def test_a_run_through_training(tmp_path, analyse):
             mean = np.mean([float(r["error"]) for r in errors if int(r["step"]) == k])
             assert own["settling_error", str(k)] == pytest.approx(mean)
         assert {step for quantity, step in own if quantity == "delta_r2"} == {"2", "3", "4"}
+        assert own["return_lost_reading_zero", "4"] == float(lost[str(path)])
         assert ("spectral_radius", "1") in own and ("spread_of_random_starts", "4") in own
     across = read(out / "training_across_seeds.csv")
     assert {row["seeds"] for row in across} == {"2"} and len(across) == len(rows) / 2
@@ -197,10 +241,20 @@ def test_checkpoints_that_look_alike_keep_their_own_panels(tmp_path, analyse):
     assert widths[0] > widths[1]
 
 
+def test_tolerances_that_do_not_exist_are_named(tmp_path, analyse, capsys):
+    """All corrections of all states have the same size: a tolerance stops every state after one step, or none."""
+    path = save(tmp_path / "best.pt")
+    params = torch.load(path, weights_only=True)["params"]
+    params["actor.2.weight"].zero_()
+    params["actor.2.bias"].fill_(0.1)
+    analyse("--checkpoint", change(path, params=params), "--num-states", 20, "--sections", "adaptive")
+    assert {row["steps_mean"] for row in read(tmp_path / "analysis/adaptive.csv")} == {"1.0", "4.0"}
+    assert "no tolerance was found that takes between 1.00 and 4.00 steps" in capsys.readouterr().out
+
+
 def test_a_one_dimensional_action_has_no_delta_r2(tmp_path, analyse, capsys):
     analyse("--checkpoint", save(tmp_path / "best.pt", "Pendulum-v1"), "--num-states", 20)
-    assert sorted(path.name for path in (tmp_path / "analysis").iterdir()) == [
-        "settling_error.csv", "settling_error.png", "summary.json"]  # fmt: skip
+    assert written(tmp_path / "analysis") == files("settling_error")
     assert "no delta R^2" in capsys.readouterr().out
 
 
@@ -219,58 +273,58 @@ def change(path: Path, **parts) -> Path:
     return path
 
 
-def malicious(path: Path) -> Path:
-    torch.save({"args": Malicious()}, path)
-    return path
-
-
 def torn(path: Path) -> Path:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     return path
 
 
-def foreign(path: Path) -> Path:
-    path.write_bytes(pickle.dumps({"args": {}}))
-    return path
+def with_arg(path: Path, **args) -> Path:
+    return change(path, args=torch.load(path, weights_only=True)["args"] | args)
 
 
-def with_param(path: Path, name: str, value: torch.Tensor) -> Path:
-    return change(path, params=torch.load(path, weights_only=True)["params"] | {name: value})
+def with_log_std(path: Path, value: torch.Tensor) -> Path:
+    return change(path, params=torch.load(path, weights_only=True)["params"] | {"log_std": value})
 
 
-def of_missing_task(path: Path) -> Path:
-    return change(path, args=torch.load(path, weights_only=True)["args"] | {"env_id": "no_such_module:Task-v0"})
+def with_nan_statistics(path: Path) -> Path:
+    statistics = torch.load(path, weights_only=True)["normalizer"]
+    statistics["obs.mean"].fill_(float("nan"))
+    return change(path, normalizer=statistics)
 
 
-NAN = torch.full((2,), float("nan"))
-BAD_INPUT = {
-    "missing file": (lambda tmp: [tmp / "best.pt"], "there is no checkpoint"),
-    "folder": (lambda tmp: [tmp], "there is no checkpoint"),
-    "torn": (lambda tmp: [torn(save(tmp / "best.pt"))], "damaged"),
-    "malicious": (lambda tmp: [malicious(tmp / "best.pt")], "damaged"),
-    "foreign": (lambda tmp: [foreign(tmp / "best.pt")], "damaged"),
-    "part missing": (lambda tmp: [change(save(tmp / "best.pt"), params=None)], "damaged"),
-    "other shapes": (lambda tmp: [with_param(save(tmp / "best.pt"), "log_std", torch.zeros(3))], "damaged"),
-    "nan": (lambda tmp: [with_param(save(tmp / "best.pt"), "log_std", NAN)], "not finite"),
-    "ppo": (lambda tmp: [save(tmp / "best.pt", script=ppo_continuous)], "PPO"),
-    "one step": (lambda tmp: [save(tmp / "best.pt", refinement_depth=1)], "K = 1"),
-    "missing package": (lambda tmp: [of_missing_task(save(tmp / "best.pt"))], "no_such_module"),
-    "second one bad": (lambda tmp: [save(tmp / "best.pt"), torn(save(tmp / "last.pt"))], "damaged"),
-    "twice": (lambda tmp: [save(tmp / "best.pt"), tmp / "." / "best.pt"], "twice"),
-    "two tasks": (lambda tmp: [save(tmp / "a.pt"), save(tmp / "b.pt", "Pendulum-v1")], "same task"),
-    "two depths": (lambda tmp: [save(tmp / "a.pt"), save(tmp / "b.pt", refinement_depth=3)], "depth"),
-    "two schedules": (lambda tmp: [save(tmp / "a.pt"), save(tmp / "b.pt", refinement_schedule="uniform")], "schedule"),
-    "no checkpoint": (lambda tmp: [], "at least one"),
-    "no section": (lambda tmp: [save(tmp / "best.pt"), "--sections"], "at least one"),
-    "only r2 of one component": (lambda tmp: [save(tmp / "best.pt", "Pendulum-v1"), "--sections", "r2"], "delta R^2"),
-    "one training step": (lambda tmp: [save(tmp / "best.pt"), "--sections", "training"], "two or more"),
-    "seeds for training": (
-        lambda tmp: [save(tmp / "a.pt"), save(tmp / "b.pt", seed=2, step=4), "--sections", "training"], "two or more"),
-    "fewer states than folds": (lambda tmp: [save(tmp / "best.pt"), "--num-states", 4], "at least 10"),
-    "one state in a fold": (lambda tmp: [save(tmp / "best.pt"), "--num-states", 9], "at least 10"),
-    "one episode": (lambda tmp: [save(tmp / "best.pt"), "--episodes", 1], "--episodes"),
-    "negative seed": (lambda tmp: [save(tmp / "best.pt"), "--seed", -1], "--seed"),
-}  # fmt: skip
+def other(path: Path, env_id="Reacher-v5", **flags) -> list[Path]:
+    """The checkpoint and a second one."""
+    return [path, save(path.with_name("other.pt"), env_id, **flags)]
+
+
+BAD_INPUT = {  # what is done with a checkpoint -> what the refusal says
+    "missing file": (lambda path: [path.with_name("no.pt")], "there is no checkpoint"),
+    "folder": (lambda path: [path.parent], "there is no checkpoint"),
+    "torn": (lambda path: [torn(path)], "damaged"),
+    "malicious": (lambda path: [torch.save({"args": Malicious()}, path) or path], "damaged"),
+    "foreign": (lambda path: [path.write_bytes(pickle.dumps({"args": {}})) and path], "damaged"),
+    "part missing": (lambda path: [change(path, params=None)], "damaged"),
+    "other shapes": (lambda path: [with_log_std(path, torch.zeros(3))], "does not fit"),
+    "nan": (lambda path: [with_log_std(path, torch.full((2,), float("nan")))], "not finite"),
+    "nan in the statistics": (lambda path: [with_nan_statistics(path)], "not finite"),
+    "ppo": (lambda path: [change(path, args=asdict(ppo_continuous.Args()))], "PPO"),
+    "one step": (lambda path: [save(path, refinement_depth=1)], "K = 1"),
+    "missing package": (lambda path: [with_arg(path, env_id="no_such_module:Task-v0")], "no_such_module"),
+    "second one bad": (lambda path: [path, torn(save(path.with_name("last.pt")))], "damaged"),
+    "twice": (lambda path: [path, path.parent / "." / path.name], "twice"),
+    "two tasks": (lambda path: other(path, "Pendulum-v1"), "same task"),
+    "two depths": (lambda path: other(path, refinement_depth=3), "depth"),
+    "two schedules": (lambda path: other(path, refinement_schedule="uniform"), "schedule"),
+    "no checkpoint": (lambda path: [], "at least one"),
+    "no section": (lambda path: [path, "--sections"], "at least one"),
+    "only r2 of one component": (lambda path: [save(path, "Pendulum-v1"), "--sections", "r2"], "delta R^2"),
+    "one training step": (lambda path: [path, "--sections", "training"], "two or more"),
+    "seeds for training": (lambda path: [*other(path, seed=2, step=4), "--sections", "training"], "two or more"),
+    "fewer states than folds": (lambda path: [path, "--num-states", 4], "at least 10"),
+    "one state in a fold": (lambda path: [path, "--num-states", 9], "at least 10"),
+    "one episode": (lambda path: [path, "--episodes", 1], "--episodes"),
+    "negative seed": (lambda path: [path, "--seed", -1], "--seed"),
+}
 
 
 @pytest.mark.parametrize("case", BAD_INPUT)
@@ -278,8 +332,7 @@ def test_bad_input_is_refused(case, tmp_path, analyse, capsys, monkeypatch):
     """One sentence, exit 2, no output folder, and nothing in the file is executed."""
     monkeypatch.chdir(tmp_path)
     make_flags, expected = BAD_INPUT[case]
-    (tmp_path / "in").mkdir()
-    flags = make_flags(tmp_path / "in")
+    flags = make_flags(save(tmp_path / "in/best.pt"))
     capsys.readouterr()
     with pytest.raises(SystemExit) as exit:
         analyse("--out-dir", tmp_path / "out", "--checkpoint", *flags)
@@ -321,14 +374,47 @@ def test_a_full_disk_is_one_sentence(tmp_path, analyse, capsys, monkeypatch):
 def test_training_and_then_its_analysis_as_a_user_types_them(tmp_path):
     """A run of two iterations with --save-every; anytime at k = K is the mean of the run's own result.json."""
     run_dir = tmp_path / "run"
-    training = run("refineppo_continuous.py", "--env-id", "Reacher-v5", "--total-timesteps", 512, "--num-steps", 256,
-                   "--num-minibatches", 4, "--update-epochs", 2, "--eval-episodes", 2, "--final-eval-episodes", 4,
-                   "--save-every", 256, "--no-compile", "--no-progress", "--run-dir", run_dir)  # fmt: skip
+    training = run(
+        "refineppo_continuous.py",
+        "--env-id",
+        "Reacher-v5",
+        "--total-timesteps",
+        512,
+        "--num-steps",
+        256,
+        "--num-minibatches",
+        4,
+        "--update-epochs",
+        2,
+        "--eval-episodes",
+        2,
+        "--final-eval-episodes",
+        4,
+        "--save-every",
+        256,
+        "--no-compile",
+        "--no-progress",
+        "--run-dir",
+        run_dir,
+    )
     assert training.returncode == 0, training.stderr
-    done = run("analysis_refinement.py", "--checkpoint", run_dir / "step_256.pt", run_dir / "step_512.pt",
-               "--num-states", 40, "--episodes", 4, "--sections", "settling", "r2", "anytime", "training")  # fmt: skip
+    done = run(
+        "analysis_refinement.py",
+        "--checkpoint",
+        run_dir / "step_256.pt",
+        run_dir / "step_512.pt",
+        "--num-states",
+        40,
+        "--episodes",
+        4,
+        "--sections",
+        "settling",
+        "r2",
+        "anytime",
+        "training",
+    )
     assert (done.returncode, done.stderr) == (0, "")
-    for name in ("settling_error", "delta_r2", "delta_r2_checks", "anytime", "training"):
+    for name in ("settling_error", "delta_r2", "delta_r2_checks", "anytime", "anytime_scaled", "training"):
         assert header(run_dir / f"analysis/{name}.csv") == "checkpoint," + COLUMNS[name]
         assert name in done.stdout
     rows = [row for row in read(run_dir / "analysis/anytime.csv") if row["checkpoint"].endswith("step_512.pt")]
