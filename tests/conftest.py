@@ -25,17 +25,16 @@ def script(request):
     return request.param
 
 
-def run(name: str, *flags, cwd=ROOT, timeout=600, **env) -> subprocess.CompletedProcess:
-    """`python NAME FLAGS` in a process of its own; tests/ can be imported there, for `module:Env-v0` ids."""
-    paths = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
-    return subprocess.run(
-        [sys.executable, str(ROOT / name), *map(str, flags)],
-        cwd=cwd,
-        timeout=timeout,
-        text=True,
-        capture_output=True,
-        env=os.environ | {"PYTHONPATH": paths} | env,
-    )
+def python(*words, cwd=ROOT, timeout=600, **env) -> subprocess.CompletedProcess:
+    """`python WORDS` in a process of its own; tests/ can be imported there, for `module:Env-v0` ids."""
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])} | env
+    command = [sys.executable, *map(str, words)]
+    return subprocess.run(command, cwd=cwd, timeout=timeout, text=True, capture_output=True, env=env)
+
+
+def run(name: str, *flags, **options) -> subprocess.CompletedProcess:
+    """The script NAME with these flags, as `python` runs it."""
+    return python(ROOT / name, *flags, **options)
 
 
 def policy_mean(module, params: dict, args, obs):

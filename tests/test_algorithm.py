@@ -264,9 +264,8 @@ def test_batch_of_several_environments(script):
     for name, expected in columns.items():
         tensor = getattr(batch, name)
         assert tensor.dtype == torch.float32 and tensor.shape == (12, *expected.shape[2:])
-        for t in range(4):
-            for i in range(3):
-                np.testing.assert_allclose(tensor[3 * t + i], expected[t, i], rtol=1e-5, atol=1e-6)
+        for row, (t, i) in zip(tensor, np.ndindex(4, 3)):
+            np.testing.assert_allclose(row, expected[t, i], rtol=1e-5, atol=1e-6)
 
 
 # --- Normalizer -------------------------------------------------------------------------------------------------------

@@ -8,13 +8,12 @@ import re
 import shlex
 import shutil
 import subprocess
-import sys
 import tomllib
 from dataclasses import fields
 from pathlib import Path
 
 import pytest
-from conftest import ROOT, run
+from conftest import ROOT, python, run
 from test_commands import QUICK
 
 import analysis_refinement
@@ -46,9 +45,8 @@ def commands(block: str) -> list[list[str]]:
     return [words for words in (shlex.split(line, comments=True) for line in lines) if words]
 
 
-def python(*words, folder: Path) -> str:
-    env = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, *words], cwd=folder, env=env, capture_output=True, text=True)
+def output(*words, folder: Path) -> str:
+    done = python(*words, cwd=folder)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -68,11 +66,11 @@ def run_command(words: list[str], folder: Path):
             known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
             assert set(extras.split(",")) - {""} <= set(known)
         case ["pytest"]:
-            found = python("-m", "pytest", "--collect-only", "-q", "-n", "0", "-p", "no:cacheprovider", folder=ROOT)
+            found = output("-m", "pytest", "--collect-only", "-q", "-n", "0", "-p", "no:cacheprovider", folder=ROOT)
             assert "tests/test_readme.py" in found
         case ["tensorboard", "--logdir", logdir]:
             assert (folder / logdir).is_dir()
-            shown = python("-m", "tensorboard.main", "--logdir", logdir, "--inspect", folder=folder)
+            shown = output("-m", "tensorboard.main", "--logdir", logdir, "--inspect", folder=folder)
             assert "charts/SPS" in shown and "eval/return_mean" in shown
         case ["python", name, "--evaluate", checkpoint, "--render"] if name in SCRIPTS:
             # MuJoCo's windows need a display; LunarLander's opens without one
@@ -114,7 +112,7 @@ def test_every_command_and_snippet(tmp_path):
     ran = []
     for language, content in blocks(readme()):
         if language == "python":
-            assert python("-c", content, folder=tmp_path).strip()
+            assert output("-c", content, folder=tmp_path).strip()
             ran.append("snippet")
         for words in commands(content) if language in ("bash", "sh", "console") else []:
             run_command(words, tmp_path)

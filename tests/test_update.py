@@ -5,7 +5,7 @@ import os
 from dataclasses import replace
 from types import SimpleNamespace
 
-import gymnasium as gym
+import conftest
 import numpy as np
 import pytest
 import torch
@@ -29,8 +29,7 @@ policies = pytest.mark.parametrize("module, flags", POLICIES, ids=POLICY_NAMES)
 def make_agent(module, dtype=torch.float64, **flags):
     """A small agent of 64 x 4 steps in 8 minibatches, away from the special initial parameters (0 and almost 0)."""
     sizes = {"num_steps": 64, "num_envs": 4, "num_minibatches": 8, "actor_hidden": (16, 16), "critic_hidden": (8, 8)}
-    spaces = (gym.spaces.Box(-limit, limit, (dim,)) for limit, dim in ((np.inf, OBS_DIM), (1.0, ACTION_DIM)))
-    agent = module.Agent(*spaces, module.Args(**sizes | flags))
+    agent = conftest.make_agent(module, OBS_DIM, ACTION_DIM, **sizes | flags)
     generator = torch.Generator().manual_seed(0)
     for name, p in agent.params.items():
         agent.params[name] = (p + 0.1 * torch.randn(p.shape, generator=generator)).to(dtype)
