@@ -97,7 +97,7 @@ class Policy:
 
     def __post_init__(self):
         self.args, self.weights = self.agent.args, layers(self.agent.arrays(), "actor")
-        self.coefficients = refineppo.refinement_coefficients(self.args.refinement_schedule, self.args.refinement_depth)
+        self.coefficients = refineppo.refinement_coefficients(self.args)
         self.label = f"seed {self.args.seed}, step {self.global_step:,}"
 
     def proposals(self, obs: np.ndarray, coefficients: list[float] | None = None) -> np.ndarray:
@@ -232,10 +232,10 @@ def record_states(policy: Policy, args: Args, stream: int = 2) -> tuple[np.ndarr
     return obs, np.repeat(np.arange(len(chosen)), [len(steps) for steps in chosen])
 
 
-def continued_coefficients(schedule: str, depth: int) -> list[float]:
+def continued_coefficients(args: refineppo.Args) -> list[float]:
     """c_1, ..., c_2K: the policy's own K; past them uniform keeps 1, average keeps 1/K, inverse goes on with 1/k."""
-    own = refineppo.refinement_coefficients(schedule, depth)
-    return own + (own if schedule == "average" else refineppo.refinement_coefficients(schedule, 2 * depth)[depth:])
+    own, twice = refineppo.refinement_coefficients(args), replace(args, refinement_depth=2 * args.refinement_depth)
+    return own * 2 if args.refinement_schedule == "average" else refineppo.refinement_coefficients(twice)
 
 
 # --- Quantities -------------------------------------------------------------------------------------------------------
@@ -407,7 +407,7 @@ def anytime_tables(policy: Policy, episodes: int) -> dict[str, Rows]:
     """Return of a = m_k for k = 0..2K; and of a = (K/k) m_k for k = 1..2K, since under the average schedule m_k is
     about k/K as large as m_K."""
     depth, tables = policy.args.refinement_depth, {"anytime": [], "anytime_scaled": []}
-    coefficients = continued_coefficients(policy.args.refinement_schedule, depth)
+    coefficients = continued_coefficients(policy.args)
     for k in progress(range(len(coefficients) + 1), desc=f"anytime, {policy.label}"):
         own = coefficients[:k] or [0.0]  # m_0 = 0
         tables["anytime"].append({"steps": k} | final_returns(policy, policy.mean(own), episodes)[1])

@@ -12,6 +12,7 @@ from sklearn.metrics import r2_score
 from sklearn.model_selection import GroupKFold, KFold
 
 import analysis_refinement as analysis
+import refineppo_continuous
 import refineppo_continuous as refineppo
 from analysis_refinement import Args, Figures, Policy
 
@@ -435,7 +436,8 @@ def test_the_fitted_network_is_128_by_128_and_reproduces_a_function_of_the_obser
     [("uniform", [1] * 6), ("average", [1 / 3] * 6), ("inverse", [1, 1 / 2, 1 / 3, 1 / 4, 1 / 5, 1 / 6])],
 )
 def test_coefficients_past_the_depth(schedule, expected):
-    assert analysis.continued_coefficients(schedule, 3) == pytest.approx(expected)
+    args = refineppo_continuous.Args(refinement_schedule=schedule, refinement_depth=3)
+    assert analysis.continued_coefficients(args) == pytest.approx(expected)
 
 
 def test_anytime_at_the_depth_is_the_checkpoints_own_evaluation():
