@@ -8,6 +8,7 @@ import re
 import shlex
 import shutil
 import subprocess
+import sys
 import tomllib
 from dataclasses import fields
 from pathlib import Path
@@ -82,7 +83,8 @@ def run_command(words: list[str], folder: Path):
             cut = words.index("|")
             chosen = dict(word.split("=") for word in words[:cut] if "=" in word)
             generator, (executor, *flags) = words[len(chosen) : cut], words[cut + 1 :]
-            chosen, dry = os.environ | chosen, [executor, "--dry-run", *flags]
+            path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])  # as in its environment
+            chosen, dry = os.environ | {"PATH": path} | chosen, [executor, "--dry-run", *flags]
             jobs = subprocess.run(generator, cwd=ROOT, env=chosen, capture_output=True, text=True)
             planned = subprocess.run(dry, cwd=ROOT, input=jobs.stdout, capture_output=True, text=True)
             assert (jobs.returncode, planned.returncode) == (0, 0), jobs.stderr + planned.stderr
