@@ -10,7 +10,7 @@ bounds. All else is `ppo_continuous.py`, line by line: only the flags, the actor
     tensorboard --logdir runs
 
 Why it is fast: one observation goes through the actor in NumPy on views of the parameters (torch's overhead per call
-is larger than the arithmetic), whatever acting does not need is computed once per rollout in one batch, and a
+is larger than the arithmetic), values and log-probabilities are computed once per rollout in one batch, and a
 minibatch update (loss, gradient, clipping, Adam) is one compiled function.
 """
 
@@ -102,7 +102,7 @@ class Args:
     clip_vloss: bool = True
     """clip the value's change in the value loss"""
     ent_coef: float = 0.0
-    """weight of the entropy bonus"""
+    """weight of the entropy bonus; to anneal it, see `compile_update`"""
     vf_coef: float = 0.5
     """weight of the value loss"""
     max_grad_norm: float = 0.5
@@ -179,7 +179,7 @@ def network(weights: list[tuple], x):
     *hidden, (w_out, b_out) = weights
     for w, b in hidden:
         x = tanh(dot(x, w) + b)
-    return dot(w_out.T, x.T).T + b_out  # x w_out: BLAS is faster with the narrow side first
+    return dot(w_out.T, x.T).T + b_out  # = x @ w_out; BLAS is faster with the narrow matrix first
 
 
 def refinement_coefficients(args: Args) -> list[float]:
@@ -198,11 +198,11 @@ def proposals(weights: list[tuple], coefficients: list[float], obs) -> list:
     (w, b), *hidden, (w_out, b_out) = weights
     w_s, w_m = w[: obs.shape[1]], w[obs.shape[1] :]
     state_share = dot(obs, w_s) + b  # W [s; m] = W_s s + W_m m, of which W_s s is the same at every step
-    m, all_m = None, []
+    m, all_m = None, []  # None stands for m_0 = 0, and saves its product
     for c in coefficients:
-        x = tanh(state_share if m is None else state_share + dot(m, w_m))  # m_0 = 0
-        for w, b in hidden:
-            x = tanh(dot(x, w) + b)
+        x = tanh(state_share if m is None else state_share + dot(m, w_m))
+        for w_hidden, b_hidden in hidden:
+            x = tanh(dot(x, w_hidden) + b_hidden)
         correction = c * (dot(w_out.T, x.T).T + b_out)
         m = correction if m is None else m + correction
         all_m.append(m)
@@ -224,7 +224,7 @@ def init_params(sizes: dict[str, list[int]], args: Args) -> dict[str, torch.Tens
 
 def layers(params: dict, name: str) -> list[tuple]:
     """The (weight, bias) pairs of the network `name`, first to last."""
-    tensors = [p for key, p in params.items() if key.startswith(name)]
+    tensors = [p for key, p in params.items() if key.startswith(f"{name}.")]
     return list(zip(tensors[::2], tensors[1::2]))
 
 
@@ -235,7 +235,7 @@ def in_rows_of_8(function, obs: np.ndarray) -> np.ndarray:
     return, does not depend on how many others are computed beside it.
     """
     rows = np.atleast_2d(obs)
-    blocks = np.resize(rows, (-(-len(rows) // 8), 8, rows.shape[1]))  # the last one is filled up with copies
+    blocks = np.resize(rows, (math.ceil(len(rows) / 8), 8, rows.shape[1]))  # the last one is filled up with copies
     out = np.concatenate([function(block) for block in blocks], axis=-2)
     return out[..., : len(rows), :] if np.ndim(obs) == 2 else out[..., 0, :]
 
@@ -274,8 +274,8 @@ class Agent:
         return {"params": self.params, "normalizer": self.normalizer.state()}
 
     def load(self, state: dict):
-        copy_into(self.params, state["params"])
-        self.normalizer.load(state["normalizer"])
+        copy_into(self.params, state["params"], state["path"])
+        copy_into(self.normalizer.state(), state["normalizer"], state["path"])
 
 
 # --- Environments and normalizer --------------------------------------------------------------------------------------
@@ -284,8 +284,8 @@ class Agent:
 class Environments:
     """N copies of a task, stepped one after the other; one whose episode ends starts the next at once.
 
-    gymnasium's SyncVectorEnv does the same under SAME_STEP autoreset, but merges every info dict: 100 us a step where
-    HalfCheetah takes 60. Every episode has a seed of its own, so that its seed and its actions replay it exactly.
+    gymnasium's SyncVectorEnv does the same under SAME_STEP autoreset, but merges every info dict: that costs 100 us a
+    step, where HalfCheetah's own takes 60. Every episode has a seed of its own: with its actions it can be replayed.
     """
 
     def __init__(self, args: Args):
@@ -298,8 +298,9 @@ class Environments:
 
     def reset(self, i: int) -> np.ndarray:
         """Start environment i's next episode."""
-        if self.envs[i] is None or "BipedalWalker" in self.args.env_id:  # this one's Box2D world keeps state between
-            if self.envs[i] is not None:  # episodes: only in a new world can one be replayed exactly
+        # BipedalWalker's Box2D world keeps state between episodes: only a new one replays an episode exactly
+        if self.envs[i] is None or "BipedalWalker" in self.args.env_id:
+            if self.envs[i] is not None:
                 self.envs[i].close()
             self.envs[i] = make_env(self.args, env=i)
         (seed,) = episode_seeds(self.args.seed, 0, i, self.episodes[i])
@@ -436,9 +437,6 @@ class Normalizer:
         arrays |= {f"returns.{name}": array for name, array in vars(self.returns).items()}
         return {name: torch.from_numpy(array) for name, array in (arrays | {"discounted": self.discounted}).items()}
 
-    def load(self, state: dict[str, torch.Tensor]):
-        copy_into(self.state(), state)
-
 
 # --- Rollout and advantages -------------------------------------------------------------------------------------------
 
@@ -473,6 +471,7 @@ def collect(agent: Agent, envs: Environments, num_steps: int, rng: np.random.Gen
 
     The actor runs in NumPy: for one observation torch's overhead per call is larger than the arithmetic.
     """
+    mujoco_warnings.clear()  # those of this rollout are logged with it
     arrays, coefficients = agent.arrays(), refinement_coefficients(agent.args)
     weights, log_std, obs = layers(arrays, "actor"), arrays["log_std"], agent.normalizer.normalize(envs.obs)
     noise = rng.standard_normal((num_steps, len(obs), len(log_std)), dtype=np.float32)
@@ -558,7 +557,7 @@ def ppo_loss(params: dict, args: Args, batch: Batch) -> tuple[torch.Tensor, torc
 
 
 class Adam:
-    """The state of Adam: the running averages of every parameter's gradient and of its square, and the step count."""
+    """Adam's state: the running averages of every parameter's gradient and of its square, and the step count."""
 
     def __init__(self, params: dict[str, torch.Tensor]):
         names = [(name, moment) for name in params for moment in ("mean", "square")]
@@ -575,7 +574,7 @@ class Adam:
         return {"moments": self.moments, "steps": self.steps}
 
     def load(self, state: dict):
-        copy_into(self.moments, state["moments"])
+        copy_into(self.moments, state["moments"], "Adam's state")
         self.steps = state["steps"]
 
 
@@ -599,7 +598,7 @@ def update(params: dict, moments: dict, args: Args, batch: Batch, index, step_si
 
 
 def learn(update_function, training: "Training", batch: Batch, learning_rate: float) -> dict[str, float]:
-    """The epochs over one rollout: the means of LOSSES over their minibatches."""
+    """The epochs over one rollout: the means of LOSSES over all minibatches (CleanRL logs the last one's)."""
     agent, adam, args, losses = training.agent, training.adam, training.agent.args, []
     step_sizes = adam.step_sizes(learning_rate, args.update_epochs * args.num_minibatches).to(agent.device).unbind()
     for _ in range(args.update_epochs):
@@ -632,7 +631,7 @@ class Progress:
 
 
 class Training:
-    """All that training changes, and so all that last.pt holds."""
+    """All that training changes, and so what last.pt holds beside the flags and the machine."""
 
     def __init__(self, args: Args):
         seed_global_rng(*episode_seeds(args.seed, 2, 0))
@@ -665,7 +664,8 @@ def main():
         training = run.begin_or_resume()
         agent, envs, progress = training.agent, training.envs, training.progress
         update_function = run.compile(training)
-        run.evaluate_if_due(agent)  # due here if the run was stopped in the middle of it
+        if run.evaluate_if_due(agent):  # a resumed run makes up for the one that a signal ended
+            run.save_last(training)
         while progress.global_step < args.last_step:
             start, before = time.time(), progress.global_step
             seed_global_rng(*episode_seeds(args.seed, 2, before))
@@ -699,12 +699,12 @@ def passed(interval: int | None, before: int, now: int) -> bool:
 
 
 def refinement_scalars(agent: Agent, obs: torch.Tensor) -> dict[str, float]:
-    """What the refinement does in an eighth of the normalised observations (batch, obs_dim).
+    """What the refinement does in a seventh of the normalised observations (batch, obs_dim).
 
     correction_norm_k: mean norm of c_k f; settling_error_k: e_k of the paper, averaged over the action components;
     outside_bounds_k: fraction of the proposals m_k with a component outside the action bounds.
     """
-    all_m = proposals(layers(agent.params, "actor"), refinement_coefficients(agent.args), obs[::8])
+    all_m = proposals(layers(agent.params, "actor"), refinement_coefficients(agent.args), obs[::7])
     low, high = (torch.from_numpy(bound).to(agent.device) for bound in (agent.low, agent.high))
     scalars, last, before = {}, all_m[-1], 0
     for k, m in enumerate(all_m, start=1):
@@ -747,7 +747,7 @@ def evaluate(agent: Agent, seeds: list[int], render_mode: str | None = None, vid
 def evaluation_seeds(args: Args, global_step: int, final: bool = False) -> list[int]:
     """Odd seeds for a final evaluation, even ones for those during training, so that no seed serves both."""
     count = args.final_eval_episodes if final else args.eval_episodes
-    return [seed - seed % 2 + final for seed in episode_seeds(args.seed, 1, global_step, count=count)]
+    return [seed - seed % 2 + int(final) for seed in episode_seeds(args.seed, 1, global_step, count=count)]
 
 
 def mean_and_std(x) -> tuple[float, float]:
@@ -759,7 +759,7 @@ def evaluate_checkpoint(given: Args):
     """--evaluate: print a saved policy's returns, which for best.pt and last.pt are those in result.json."""
     path = Path(given.evaluate).expanduser()
     checkpoint = load_checkpoint(path)
-    own = ("evaluate", "final_eval_episodes", "render", "capture_video", "track", "num_threads", "cuda")
+    own = ("evaluate", "final_eval_episodes", "render", "capture_video", "num_threads", "cuda")
     args = replace(Args(**checkpoint["args"]), **{name: getattr(given, name) for name in own})
     check_args(args)
     videos = path.with_suffix(".videos") if args.capture_video else None
@@ -808,20 +808,20 @@ class Task(gym.Wrapper):
 
     def __init__(self, env: gym.Env, facts: dict):
         super().__init__(env)
-        self.facts, self.episode_seed, self.episode_step = facts, None, 0
+        self.facts = facts
         self.obs_shape, self.action_dtype = env.observation_space.shape, env.action_space.dtype
-        with suppress(AttributeError):  # where it is computed anew at every access
+        with suppress(AttributeError):  # in some tasks it is a property
             self.unwrapped.action_space = deepcopy(self.unwrapped.action_space)  # copies of a task often share it
         open_tasks.append(self)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
-        self.episode_seed, self.episode_step = seed, 0
+        self.facts |= {"episode_seed": seed, "episode_step": 0}
         self.unwrapped.action_space.seed(seed)  # some tasks draw from it
         obs, info = ask(self.env.reset, seed=seed, options=options)
         return self.checked(obs), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        self.episode_step += 1
+        self.facts["episode_step"] += 1
         obs, reward, terminated, truncated, info = ask(self.env.step, np.array(action, self.action_dtype))
         reward = np.asarray(reward, float).item()
         return self.checked(obs, reward), reward, bool(terminated), bool(truncated), info
@@ -833,8 +833,7 @@ class Task(gym.Wrapper):
         if not math.isfinite(obs.dot(obs) + reward):  # the square of a large number may be infinite: look closer
             for what, x in (("an observation", obs), ("a reward", reward)):
                 if not np.isfinite(x).all():
-                    replay = {"episode_seed": self.episode_seed, "episode_step": self.episode_step}
-                    raise NotFinite(what=what, **self.facts, **replay, value=str(x))
+                    raise NotFinite(what=what, **self.facts, value=str(x))
         return obs
 
     def close(self):
@@ -907,11 +906,11 @@ RULES_BY_TYPE = {int: ("at least 1", lambda x: x >= 1), float: ("a finite number
 
 
 def say(text: str):
-    """Print a line, above the progress bar; a reader that has left (`| head`) does not end a training."""
+    """Print a line, above the progress bar; a reader that has left (`| head`, a closed terminal) ends no training."""
     try:
         tqdm.write(text)
         sys.stdout.flush()
-    except BrokenPipeError:
+    except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -933,7 +932,7 @@ def draw_once(args: Args):
         agent = Agent(task.observation_space, task.action_space, args)
         if args.render:
             evaluate(agent, [0], "human")
-        if args.capture_video:
+        else:
             evaluate(agent, [0], "rgb_array", Path(folder.name))
             if not any(Path(folder.name).iterdir()):
                 raise ValueError("it gives no pictures as rgb_array")
@@ -954,15 +953,13 @@ def refusing(sentence: str, advice: str = ""):
 
 
 def check_args(args: Args):
-    """Refuse what cannot be trained or evaluated before any work starts; limit the threads, on which bits depend."""
+    """Refuse what cannot be trained or evaluated; set the number of threads, which changes the last bits of results."""
     for flag in fields(args):
         value, name = getattr(args, flag.name), flag.name.replace("_", "-")
-        for x in value if isinstance(value, tuple) else (value,):
+        for x in value or (0,) if isinstance(value, tuple) else (value,):  # no layers are refused as one of 0 units
             rule, holds = RULES.get(flag.name) or RULES_BY_TYPE.get(type(x)) or ("", lambda x: True)
             if x is not None and not holds(x):
                 refuse(f"--{name} must be {rule}, not {value}")
-        if value == ():
-            refuse(f"--{name} must be at least 1 layer")
     if args.batch_size % args.num_minibatches:
         steps = f"{args.batch_size} steps ({args.num_envs} environments x {args.num_steps} steps)"
         refuse(f"{args.num_minibatches} minibatches do not divide a rollout of {steps} evenly")
@@ -972,12 +969,15 @@ def check_args(args: Args):
         refuse(f"--total-timesteps {args.total_timesteps} is less than one rollout of {args.batch_size} steps")
     if args.resume and not args.run_dir and not args.evaluate:
         refuse("--resume needs --run-dir, the folder of the run to continue")
-    if args.render and not args.evaluate:
-        refuse("--render shows the episodes of --evaluate; training is not shown")
-    for extra, wanted, module in (("track", args.track, "wandb"), ("video", args.capture_video, "moviepy")):
+    if args.render and (args.capture_video or not args.evaluate):
+        refuse("--render shows the episodes of --evaluate; it does not show training, and excludes --capture-video")
+    for extra, wanted, module in (
+        ("track", args.track and not args.evaluate, "wandb"),
+        ("video", args.capture_video, "moviepy"),
+    ):
         if wanted and find_spec(module) is None:
             refuse(f"the package {module} is missing: pip install -e '.[{extra}]'")
-    if args.track:
+    if args.track and not args.evaluate:
         check_wandb()
     if args.cuda and not torch.cuda.is_available():
         refuse("--cuda was asked for, but torch finds no CUDA device")
@@ -1032,7 +1032,7 @@ def check_task(args: Args):
             refuse(f"cannot draw {task_id}: it ended the process that tried to; {HOW_TO_DRAW}")
     std = math.exp(args.log_std_init)
     bounds = zip((actions.low / std).tolist(), (actions.high / std).tolist())
-    if min(math.erf(high / 2**0.5) - math.erf(low / 2**0.5) for low, high in bounds) < 0.02:
+    if min(math.erf(high / 2**0.5) - math.erf(low / 2**0.5) for low, high in bounds) < 0.02:  # of 2
         start = f"a policy that starts as Normal(0, {std:.2g}) hardly ever gets there"
         say(f"warning: {task_id} has actions in {actions}; {start}: rescale them with gymnasium's RescaleAction")
     if task.spec.max_episode_steps is None:
@@ -1046,13 +1046,14 @@ def check_task(args: Args):
 def compile_update(training: Training):
     """The compiled `update`, or None, with one line that says why, where it cannot be compiled.
 
-    It is compiled by running it once on zeros; parameters and moments are restored. Shapes never change in a run, so
-    all guards are skipped: the compiled function keeps every number that it saw at this first call. What is to change
-    while training must therefore be a tensor, which it reads anew at every call. So, to anneal the entropy bonus, set
-    `agent.args = replace(args, ent_coef=torch.tensor(0.01))` before this, and call its `fill_` in main's loop.
+    It is compiled by running it once, on zeros and copies. Shapes never change in a run, so all guards are skipped: the
+    compiled function keeps every number that it saw at this first call. What is to change while training must therefore
+    be a tensor, which it reads anew at every call. To anneal the entropy bonus, in main, before this and in its loop:
+
+        agent.args = replace(args, ent_coef=torch.tensor(args.ent_coef, device=agent.device))
+        agent.args.ent_coef.fill_(args.ent_coef * (1 - before / args.last_step))
     """
-    agent, moments = training.agent, training.adam.moments
-    args, tensors = agent.args, [*agent.params.values(), *moments.values()]
+    agent, args = training.agent, training.agent.args
     shapes = (len(agent.params["critic.0.weight"]),), (len(agent.params["log_std"]),), (), (), (), ()
     batch = Batch(*(torch.zeros(args.batch_size, *shape, device=agent.device) for shape in shapes))
     index = torch.arange(args.batch_size // args.num_minibatches, device=agent.device)
@@ -1060,12 +1061,12 @@ def compile_update(training: Training):
     options = {"guard_filter_fn": torch.compiler.skip_all_guards_unsafe}
     if not args.cuda:  # C++ calls the kernels; tanh from exp; on small matrices a bias in the next kernel beats addmm
         options |= {"cpp_wrapper": True, "cpp.use_decompose_tanh": True, "pattern_matcher": False}
-    start, before = time.time(), [x.clone() for x in tensors]
+    start, changed = time.time(), deepcopy((agent.params, training.adam.moments))
     say("compiling the update (up to a minute the first time, seconds from the cache after that) ...")
 
     def compile_and_run():
         compiled = torch.compile(update, fullgraph=True, dynamic=False, options=options)
-        compiled(agent.params, moments, args, batch, index, step_size)
+        compiled(*changed, args, batch, index, step_size)
         return compiled
 
     try:
@@ -1081,8 +1082,6 @@ def compile_update(training: Training):
         lines = (line for line in str(error).splitlines() if " error: " in line)  # the C++ compiler's own
         say(f"compilation failed, training goes on uncompiled: {next(lines, first_line(error))}")
         return None
-    for x, old in zip(tensors, before):
-        x.copy_(old)
     if not torch._dynamo.utils.counters["stats"]["unique_graphs"]:
         say("torch.compile is switched off (TORCHDYNAMO_DISABLE?), training goes on uncompiled")
         return None
@@ -1101,10 +1100,9 @@ def write_atomically(path: Path, data: bytes):
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-    except OSError:
-        temporary.unlink(missing_ok=True)  # a full disk is not to stay full of it
-        raise
-    os.replace(temporary, path)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)  # after a failure: a full disk is not to stay full of it
 
 
 def save_checkpoint(path: Path, state: dict):
@@ -1130,15 +1128,15 @@ def load_checkpoint(path: Path) -> dict:
         refuse(f"{path} is damaged or not a checkpoint of {SCRIPT}")
     if state["args"].keys() != {flag.name for flag in fields(Args)}:
         refuse(f"{path} was not written by this {SCRIPT}: it has other flags")
-    return state
+    return state | {"path": str(path)}
 
 
-def copy_into(tensors: dict[str, torch.Tensor], saved: dict[str, torch.Tensor]):
+def copy_into(tensors: dict[str, torch.Tensor], saved: dict[str, torch.Tensor], path: str):
     """Copy a checkpoint's tensors in place, or refuse it if they are not of the same names and shapes."""
     for name in tensors.keys() | saved.keys():
         have, want = (tuple(x[name].shape) if name in x else "missing" for x in (saved, tensors))
         if have != want:
-            refuse(f"the checkpoint does not fit this {SCRIPT}: {name} is {have} there, and {want} here")
+            refuse(f"{path} does not fit this {SCRIPT}: {name} is {have} there, and {want} here")
     for name, tensor in tensors.items():
         tensor.copy_(saved[name])
 
@@ -1184,30 +1182,33 @@ class Run:
     def __init__(self, args: Args):
         name = f"runs/{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}"
         self.args, self.dir = args, Path(args.run_dir or name).expanduser()
-        self.machine, self.clock, self.compiled = describe_machine(), time.time(), False
+        self.machine, self.start, self.compiled = describe_machine(), time.time(), False
         self.last_return = self.last_evaluation = "-"  # shown by the progress bar
         self.stack = ExitStack()  # what is to be closed, however the run ends
         self.progress, self.wandb_run = Progress(), None
         try:
             str(self.dir).encode()
+            self.dir.mkdir(parents=True, exist_ok=True)
+            known = (self.dir / ".lock").exists()  # a run of ours was here before
+            begun = [path.name for path in self.dir.iterdir() if path.name != ".lock"]
         except UnicodeEncodeError:  # it has bytes that the locale cannot decode
             refuse(f"this locale cannot spell the folder {ascii(str(self.dir))}; PYTHONUTF8=1 helps")
-        try:
-            self.dir.mkdir(parents=True, exist_ok=True)
-            self.lock()
-            begun = [path for path in self.dir.iterdir() if path.name != ".lock"]
         except OSError as error:
             refuse(f"cannot write to the run folder {self.dir}: {error.strerror}")
         if begun and not args.resume:
             refuse(f"the run folder {self.dir} is not empty; name another --run-dir, or continue its run with --resume")
+        if not known and not any(name.endswith((".pt", "result.json")) for name in begun):
+            written = ("config.json", "evaluations.csv", "events.out.tfevents.")
+            if any(name.startswith(written) for name in begun):
+                refuse(f"the files in {self.dir} are not of a run of {SCRIPT}; name another --run-dir")
+        if not (self.dir / "result.json").exists():
+            self.lock()
         self.checkpoint = self.find_checkpoint()
 
     def lock(self):
         """Refuse a folder in which another process is at work; the lock ends with its process, even one killed."""
-        lock = filelock.FileLock(self.dir / ".lock")
         try:
-            lock.acquire(blocking=False)
-            self.stack.callback(lock.release)
+            self.stack.enter_context(filelock.FileLock(self.dir / ".lock", blocking=False))
         except filelock.Timeout:
             refuse(f"another process is at work in {self.dir}")
         except NotImplementedError:  # this file system has no locks
@@ -1254,8 +1255,7 @@ class Run:
         if isinstance(error, NotFinite):
             facts = error.facts | {"global_step": self.progress.global_step, "mujoco_warnings": mujoco_warnings[:5]}
             write_atomically(self.dir / "failure.json", json.dumps(facts, indent=2).encode())
-            failure = f"numerical failure: {facts} (also in {self.dir / 'failure.json'})"
-            print(f"{SCRIPT}: {failure}", file=sys.stderr)
+            print(f"{SCRIPT}: numerical failure: {facts} (also in {self.dir / 'failure.json'})", file=sys.stderr)
             raise SystemExit(EXIT_FAILURE)
 
     def begin_or_resume(self) -> Training:
@@ -1264,6 +1264,7 @@ class Run:
         if saved:
             training.load(saved)
         progress = self.progress = training.progress
+        self.start -= progress.wall_seconds  # the time of a resumed run's earlier parts counts too
         self.write_evaluations()
         if self.args.track:
             self.track()
@@ -1271,8 +1272,8 @@ class Run:
         self.stack.callback(self.writer.close)
         if not saved:
             self.log_hyperparameters()
-        shown = None if self.args.progress else True  # None: on a terminal
-        self.bar = tqdm(total=self.args.last_step, unit=" steps", unit_scale=True, smoothing=0.05, disable=shown)
+        hidden = None if self.args.progress else True  # None: only where there is no terminal
+        self.bar = tqdm(total=self.args.last_step, unit=" steps", unit_scale=True, smoothing=0.05, disable=hidden)
         self.bar.update(progress.global_step)
         self.stack.callback(self.bar.close)
         return training
@@ -1341,22 +1342,21 @@ class Run:
             if episode_step > 0.9 * self.args.total_timesteps:
                 self.progress.late_returns.append(episode_return)
         self.log_scalars(scalars | {"charts/mujoco_warnings": len(mujoco_warnings)}, step)
-        mujoco_warnings.clear()
         self.bar.set_postfix_str(f"return {self.last_return}, evaluation {self.last_evaluation}", refresh=False)
         self.bar.update(self.args.batch_size)
 
-    def evaluate_if_due(self, agent: Agent):
-        """At the first rollout's end at or after each multiple of --eval-interval, and at the end of training.
+    def evaluate_if_due(self, agent: Agent) -> bool:
+        """At the first rollout's end at or after each multiple of --eval-interval, and at the end; whether it was.
 
         One that a signal ends leaves no trace, and is made when the run is continued.
         """
         args, progress, step = self.args, self.progress, self.progress.global_step
         due = passed(args.eval_interval, max(step - args.batch_size, 0), step) or step == args.last_step
         if not due or (progress.evaluations and progress.evaluations[-1][0] == step):
-            return
+            return False
         returns, lengths = evaluate(agent, evaluation_seeds(args, step))
         if stop_signals:
-            return
+            return False
         mean, std = mean_and_std(returns)
         progress.evaluations.append((step, mean, std, *map(float, (returns.min(), returns.max(), lengths.mean()))))
         self.write_evaluations()
@@ -1369,6 +1369,7 @@ class Run:
         if args.progress:
             rate = f"best {progress.best_return:.1f}, {step / progress.train_seconds:.0f} steps/s"
             say(f"step {step:,}: evaluation return {mean:.1f} +- {std:.1f}, {rate}")
+        return True
 
     def write_evaluations(self):
         rows = ["global_step,return_mean,return_std,return_min,return_max,length_mean"]
@@ -1383,9 +1384,7 @@ class Run:
     def save_last(self, training: Training):
         """The checkpoint that continues the run."""
         self.writer.flush()
-        now = time.time()
-        self.progress.wall_seconds += now - self.clock
-        self.clock = now
+        self.progress.wall_seconds = time.time() - self.start
         self.save("last.pt", training.agent, **training.state(), compiled=self.compiled, machine=self.machine)
 
     def exit_if_stopped(self):
@@ -1409,19 +1408,20 @@ class Run:
             self.exit_if_stopped()
             mean, std = mean_and_std(returns)
             final[name] = {"global_step": saved["global_step"], "returns": returns.tolist(), "mean": mean, "std": std}
+            say(f"{name}: return {mean:.1f} +- {std:.1f} at step {saved['global_step']:,}")
         # one step on: if a kill precedes result.json, the resumed run drops it
         self.log_scalars({f"final/{name}_mean": final[name]["mean"] for name in final}, progress.global_step + 1)
         self.writer.flush()
         final["best"]["selection_return"] = progress.best_return
         flags = ("env_id", "exp_name", "seed", "total_timesteps", "refinement_depth", "refinement_schedule")
-        result = {name: getattr(args, name, None) for name in flags} | final
+        result = {name: getattr(args, name, None) for name in flags} | final  # None: PPO has no refinement
         result["std_ddof"] = 1
         result["train_return_last10pct"] = float(np.mean(progress.late_returns)) if progress.late_returns else None
-        result["wall_time_s"] = progress.wall_seconds + time.time() - self.clock
+        result["wall_time_s"] = time.time() - self.start
         result["sps"] = progress.global_step / progress.train_seconds
         write_atomically(self.dir / "result.json", json.dumps(result, indent=2).encode())
-        for name in ("best", "last"):
-            say("{}: return {mean:.1f} +- {std:.1f} at step {global_step:,}".format(name, **final[name]))
+        with suppress(OSError):  # Windows removes no open file
+            (self.dir / ".lock").unlink()
         say(f"the run is in {self.dir}; look at it with: tensorboard --logdir {shlex.quote(str(self.dir))}")
 
 

@@ -11,6 +11,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 import pytest  # noqa: E402
 import torch  # noqa: E402
+from gymnasium.spaces import Box  # noqa: E402
 
 import ppo_continuous  # noqa: E402
 import refineppo_continuous  # noqa: E402
@@ -24,10 +25,26 @@ def script(request):
     return request.param
 
 
-def run(name: str, *flags, cwd=ROOT, timeout=600, **env) -> subprocess.CompletedProcess:
-    """`python NAME FLAGS` in a process of its own; tests/ can be imported there, for `module:Env-v0` ids."""
-    paths = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
-    return subprocess.run(
-        [sys.executable, str(ROOT / name), *map(str, flags)],
-        cwd=cwd, timeout=timeout, text=True, capture_output=True, env=os.environ | {"PYTHONPATH": paths} | env,
-    )  # fmt: skip
+def python(*words, cwd=ROOT, timeout=600, **env) -> subprocess.CompletedProcess:
+    """`python WORDS` in a process of its own; tests/ can be imported there, for `module:Env-v0` ids."""
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])} | env
+    command = [sys.executable, *map(str, words)]
+    return subprocess.run(command, cwd=cwd, timeout=timeout, text=True, capture_output=True, env=env)
+
+
+def run(name: str, *flags, **options) -> subprocess.CompletedProcess:
+    """The script NAME with these flags, as `python` runs it."""
+    return python(ROOT / name, *flags, **options)
+
+
+def policy_mean(module, params: dict, args, obs):
+    """The script's action mean (batch, action_dim) of normalised observations, in arrays or in tensors."""
+    weights = module.layers(params, "actor")
+    if module is ppo_continuous:
+        return module.network(weights, obs)
+    return module.proposals(weights, module.refinement_coefficients(args), obs)[-1]
+
+
+def make_agent(module, obs_dim=3, action_dim=2, **flags):
+    """A fresh agent for no task in particular, with actions within +-1."""
+    return module.Agent(Box(-1, 1, (obs_dim,)), Box(-1, 1, (action_dim,)), module.Args(**flags))

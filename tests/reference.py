@@ -85,8 +85,15 @@ def mlp(sizes: list[int], output_gain: float) -> nn.Sequential:
 class Agent(nn.Module):
     """The Gaussian policy and the value function; K = None is plain PPO."""
 
-    def __init__(self, obs_dim: int, action_dim: int, K: int | None = None, schedule: str = "average",
-                 actor_hidden=(128, 128), critic_hidden=(64, 64)):  # fmt: skip
+    def __init__(
+        self,
+        obs_dim: int,
+        action_dim: int,
+        K: int | None,
+        schedule: str,
+        actor_hidden=(128, 128),
+        critic_hidden=(64, 64),
+    ):
         super().__init__()
         self.K, self.schedule, self.action_dim = K, schedule, action_dim
         self.actor = mlp([obs_dim if K is None else obs_dim + action_dim, *actor_hidden, action_dim], 0.01)
@@ -94,10 +101,10 @@ class Agent(nn.Module):
         self.log_std = nn.Parameter(torch.zeros(action_dim))
 
     def mean(self, obs: torch.Tensor) -> torch.Tensor:
-        """The action mean (batch, action_dim): f(s), or m_K from m_0 = 0 and m_k = m_{k-1} + c_k f([s; m_{k-1}])."""
+        """The action mean (..., action_dim): f(s), or m_K from m_0 = 0 and m_k = m_{k-1} + c_k f([s; m_{k-1}])."""
         if self.K is None:
             return self.actor(obs)
-        m = obs.new_zeros(len(obs), self.action_dim)
+        m = obs.new_zeros(*obs.shape[:-1], self.action_dim)
         for k in range(1, self.K + 1):
             c = {"average": 1 / self.K, "uniform": 1.0, "inverse": 1 / k}[self.schedule]
             m = m + c * self.actor(torch.cat([obs, m], dim=-1))
@@ -164,8 +171,8 @@ def train(args: Args) -> tuple[list[tuple[int, float]], float]:
     """Train; return the (global step, raw return) of every episode, and the steps per second."""
     torch.manual_seed(args.seed)
     device = torch.device("cuda" if args.cuda else "cpu")
-    envs = gym.vector.SyncVectorEnv([lambda: make_env(args.env_id, args.gamma)] * args.num_envs,
-                                    autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)  # fmt: skip
+    makers = [lambda: make_env(args.env_id, args.gamma)] * args.num_envs
+    envs = gym.vector.SyncVectorEnv(makers, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)
     obs_dim, action_dim = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
     K = args.refinement_depth if args.algorithm == "refineppo" else None
     agent = Agent(obs_dim, action_dim, K, args.refinement_schedule).to(device)

@@ -1,8 +1,4 @@
-"""Runs that are killed, stopped or starved at an exact place, and all that a run leaves behind, made comparable.
-
-It also registers `resume_helpers:Faulty-v0`: the episode with the seed, at the step and in the way that the environment
-variable FAULT names, as "seed step way", has a bad number or crashes.
-"""
+"""Runs that are killed, stopped or starved at an exact place, and all that a run leaves behind, made comparable."""
 
 import hashlib
 import json
@@ -13,12 +9,11 @@ import signal
 import sys
 import time
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
-import gymnasium as gym
 import torch
 import torch._inductor  # seconds that every fork would spend again
-from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 ROOT = Path(__file__).parent.parent
@@ -71,16 +66,29 @@ def send(*signals: int):
 kill = send(signal.SIGKILL)
 
 
+def lines_with(script: str, piece: str) -> list[int]:
+    """The numbers of the script's lines that contain the piece of text."""
+    lines = (ROOT / script).read_text().splitlines()
+    numbers = [number for number, line in enumerate(lines, start=1) if piece in line]
+    assert numbers, f"no line of {script} contains {piece!r}"
+    return numbers
+
+
 class Run:
     """`python SCRIPT FLAGS` in a fork of this process, which saves the seconds that importing torch takes.
 
-    With `at` = (function, n), `action` is called before the n-th line, counted from 1, that the process executes in
-    that function of the script: an exact place, where a clock would only hit the slow ones. `before` is called first.
+    `action` is called at an exact place, where a clock would only hit the slow ones: with `at` = (piece of text, n)
+    before the script executes for the n-th time a line that contains the text (or has this number), with `after` =
+    (file name, n) when the n-th version of the file is in place. `before` is called first.
     """
 
-    def __init__(self, script: str, words: list, log: Path, at=None, action=kill, before=None):
+    def __init__(self, script: str, words: list, log: Path, at=None, after=None, action=kill, before=None):
         self.path, self.words, self.log = str(ROOT / script), [str(word) for word in words], log
-        self.at, self.action, self.before = at, action, before
+        self.after, self.action, self.before = after, action, before
+        if at:
+            piece, n = at
+            at = lines_with(script, piece) if isinstance(piece, str) else [piece], n
+        self.at = at
         self.process = multiprocessing.get_context("fork").Process(target=self.child)
         self.process.start()
 
@@ -92,25 +100,34 @@ class Run:
         sys.argv = [self.path, *self.words]
         if self.before:
             self.before()
+        if self.after:
+            os.replace = self.replacing(os.replace, *self.after)
         if self.at:
-            sys.settrace(self.tracer(*self.at))
+            (lines, n), executed = self.at, 0
+
+            def count(_):
+                nonlocal executed
+                executed += 1
+                if executed == n:
+                    self.action()
+
+            sys.settrace(tracer(self.path, count, frozenset(lines)))
         runpy.run_path(self.path, run_name="__main__")
 
-    def tracer(self, function: str, n: int):
-        lines = 0
+    def replacing(self, replace, name: str, n: int):
+        """os.replace, which acts as soon as it has put the n-th version of the file in place."""
+        versions = 0
 
-        def trace(frame, event, _):
-            nonlocal lines
-            if frame.f_code.co_name != function or frame.f_code.co_filename != self.path:
-                return None
-            lines += event == "line"
-            if event == "line" and lines == n:
+        def replace_and_act(source, target):
+            nonlocal versions
+            replace(source, target)
+            versions += Path(target).name == name
+            if Path(target).name == name and versions == n:
                 self.action()
-            return trace
 
-        return trace
+        return replace_and_act
 
-    def wait(self, timeout=300) -> int:
+    def wait(self, timeout=600) -> int:
         """The exit code; minus the signal's number if one killed the process."""
         self.process.join(timeout)
         assert self.process.exitcode is not None, f"still running after {timeout} s"
@@ -123,34 +140,62 @@ class Run:
             time.sleep(0.01)
 
     def output(self) -> str:
-        return self.log.read_text() if self.log.exists() else ""
+        return self.log.read_text(errors="replace") if self.log.exists() else ""
 
 
-def finish(script: str, words: list, log: Path) -> str:
+def tracer(path: str, seen, lines: frozenset = frozenset()):
+    """For sys.settrace: `seen(line number)` before every line, or every one of these lines, that the file executes."""
+
+    @cache  # most functions have none of the lines, and go on at full speed
+    def is_watched(code) -> bool:
+        return code.co_filename == path and (not lines or any(line in lines for *_, line in code.co_lines()))
+
+    def trace(frame, event, _):
+        if event == "call" and not is_watched(frame.f_code):
+            return None
+        if event == "line" and (not lines or frame.f_lineno in lines):
+            seen(frame.f_lineno)
+        return trace
+
+    return trace
+
+
+def finish(script: str, words: list, log: Path, **more) -> str:
     """Run to the end; what it printed."""
-    run = Run(script, words, log)
+    run = Run(script, words, log, **more)
     assert run.wait() == 0, run.output()
     return run.output()
 
 
-def count_lines(script: str, words: list, log: Path, functions: tuple[str, ...]) -> Counter:
-    """Run to the end; how many lines it executed in each of the functions."""
-    path, counts, file = str(ROOT / script), Counter(), log.with_suffix(".json")
+def killed_after(versions: int, script: str, words: list, log: Path):
+    """Run until last.pt is there for this time, and kill it there."""
+    killed = Run(script, words, log, after=("last.pt", versions))
+    assert killed.wait() == -signal.SIGKILL, killed.output()
 
-    def trace(frame, event, _):
-        function = frame.f_code.co_name
-        if function not in functions or frame.f_code.co_filename != path:
-            return None
-        counts[function] += event == "line"
-        return trace
+
+def refusal(script: str, words: list, log: Path) -> str:
+    """The one sentence with which the command is refused, below a task's own traceback and warnings."""
+    refused = Run(script, words, log)
+    assert refused.wait() == 2, refused.output()
+    *above, sentence = refused.output().splitlines()
+    assert sentence.startswith(f"{script}: error: "), refused.output()
+    assert not above or above[0].startswith(("warning: ", "Traceback")), refused.output()
+    return sentence
+
+
+def count_lines(script: str, words: list, log: Path) -> Counter:
+    """Run to the end; how often it executed each of the script's lines."""
+    counts, file = Counter(), log.with_suffix(".json")
+
+    def count(line):
+        counts[line] += 1
 
     def before():
-        sys.settrace(trace)
+        sys.settrace(tracer(str(ROOT / script), count))
         multiprocessing.util.Finalize(None, lambda: file.write_text(json.dumps(counts)), exitpriority=0)
 
-    run = Run(script, words, log, before=before)
-    assert run.wait() == 0, run.output()
-    return Counter(json.loads(file.read_text()))
+    finish(script, words, log, before=before)
+    return Counter({int(line): n for line, n in json.loads(file.read_text()).items()})
 
 
 # --- What a run leaves behind -----------------------------------------------------------------------------------------
@@ -168,7 +213,7 @@ def flatten(name: str, x) -> dict[str, str]:
 
 def outcome(run_dir: Path) -> dict[str, str]:
     """All that must be equal in two runs of the same flags: everything but timings and the machine."""
-    names = sorted(path.name for path in run_dir.iterdir() if not path.name.startswith("events.out"))
+    names = sorted(path.name for path in run_dir.iterdir() if not path.name.startswith(("events.out", ".lock")))
     found = {"files": " ".join(names), "evaluations.csv": (run_dir / "evaluations.csv").read_text()}
     for path in run_dir.glob("*.pt"):
         state = torch.load(path, weights_only=True)
@@ -192,56 +237,3 @@ def tensorboard(run_dir: Path) -> dict[str, str]:
 def differences(one: dict, other: dict) -> list[str]:
     """What differs between two outcomes."""
     return sorted(key for key in one.keys() | other.keys() if one.get(key) != other.get(key))
-
-
-# --- Environments that fail on demand ---------------------------------------------------------------------------------
-
-
-class Faulty(gym.Env):
-    """Random observations and rewards; in the episode and at the step that FAULT names, one of them is bad."""
-
-    observation_space = gym.spaces.Box(-1, 1, (3,), float)
-    action_space = gym.spaces.Box(-1, 1, (1,))
-
-    def __init__(self, render_mode=None, scale=1.0):
-        self.render_mode, self.scale = render_mode, scale
-
-    def reset(self, seed=None, options=None):
-        super().reset(seed=seed)
-        fault_seed, step, self.way = os.environ.get("FAULT", "-1 0 none").split()
-        self.steps, self.fault = 0, int(step) if seed == int(fault_seed) else None
-        return self.np_random.uniform(-1, 1, 3), {}
-
-    def step(self, action):
-        obs, reward = self.np_random.uniform(-1, 1, 3), self.scale * self.np_random.normal()
-        self.steps += 1
-        if self.steps == self.fault:
-            if self.way == "crash":
-                raise RuntimeError("the simulator crashed")
-            number, what = self.way.rsplit("-", 1)
-            if what == "reward":
-                reward = float(number)
-            else:
-                obs[1] = float(number)
-        return obs, reward, False, False, {}
-
-
-class Unstable(HalfCheetahEnv):
-    """HalfCheetah that explodes at the 100th step of every episode, upon which MuJoCo resets it with a warning."""
-
-    steps = 0
-
-    def reset(self, **kwargs):
-        self.steps = 0
-        return super().reset(**kwargs)
-
-    def step(self, action):
-        self.steps += 1
-        if self.steps == 100:
-            self.data.qvel[:] = 1e20
-        return super().step(action)
-
-
-gym.register("Faulty-v0", Faulty, max_episode_steps=40)
-gym.register("Huge-v0", Faulty, max_episode_steps=40, kwargs={"scale": 1e30})
-gym.register("Unstable-v0", Unstable, max_episode_steps=150)

@@ -21,19 +21,22 @@ from pathlib import Path
 sys.path[:0] = [str(Path(__file__).parent.parent), str(Path(__file__).parent)]
 
 import torch  # noqa: E402
-from resume_helpers import SCRIPTS, TASKS, Run, differences, flags, outcome, send  # noqa: E402
+from resume_helpers import SCRIPTS, TASKS, Run, differences, finish, flags, outcome, send  # noqa: E402
 
 import ppo_continuous  # noqa: E402, F401  (every run is a fork of this process and needs the same imports)
 
-PLACES = {  # functions, and how many lines a process may execute there before it is interrupted
-    "main": 600,
-    "collect": 6000,
-    "step": 8000,
-    "learn": 400,
-    "evaluate": 10_000,
-    "write_atomically": 150,
+PLACES = {  # pieces of the scripts' lines, and how often a process may execute one before it is interrupted
+    "training = run.begin_or_resume()": 1,
+    "self.actions[i].append(": 8000,
+    "torch.from_numpy(rollout.obs)": 16,
+    "update_function(agent.params": 400,
+    "add_scalar(": 600,
+    "lengths[i] += 1": 10_000,
+    "torch.save(state": 20,
+    "os.fsync(": 30,
+    "os.replace(": 30,
 }
-SIGNALS = (signal.SIGKILL,) * 6 + (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
+SIGNALS = (signal.SIGKILL,) * 6 + (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, signal.SIGHUP)
 
 
 def random_settings(rng: random.Random) -> dict:
@@ -64,14 +67,14 @@ def interrupt(rng: random.Random, script: str, words: list, log: Path, seconds: 
     signum = rng.choice(SIGNALS)
     if rng.random() < 0.5:
         place = rng.choice(list(PLACES))
-        line = int(PLACES[place] ** rng.random())  # as often among the first ten as among the first thousand
-        run = Run(script, words, log, at=(place, line), action=send(signum))
+        n = int(PLACES[place] ** rng.random())  # as often among the first ten as among the first thousand
+        run = Run(script, words, log, at=(place, n), action=send(signum))
     else:
         run = Run(script, words, log)
         run.process.join(rng.uniform(0, seconds))
         if run.process.is_alive():
             os.kill(run.process.pid, signum)
-    code = run.wait(600)
+    code = run.wait(1200)
     if code not in (0, 75, -signum):  # minus the signal: it was SIGKILL, or came before the handlers were in place
         raise SystemExit(f"exit code {code} after {signum.name}:\n{run.output()}")
     return signum.name if code else "end"
@@ -90,16 +93,14 @@ def main():
         rng = random.Random(f"{options.seed} {rounds}")
         script, settings = rng.choice(SCRIPTS), random_settings(rng)
         start = time.time()
-        whole = Run(script, flags(folder / "whole", **settings), folder / "whole.log")
-        if whole.wait(600):
-            raise SystemExit(f"{script} {settings} failed:\n{whole.output()}")
+        finish(script, flags(folder / "whole", **settings), folder / "whole.log")
         seconds, words, ends = time.time() - start, flags(folder / "killed", "--resume", **settings), []
         for _ in range(rng.randint(1, 10)):
             ends.append(interrupt(rng, script, words, folder / "killed.log", seconds))
             if ends[-1] == "end":
                 break
         last = Run(script, words, folder / "killed.log")
-        if last.wait(600):
+        if last.wait(1200):
             raise SystemExit(f"{script} {settings} could not be continued:\n{last.output()}\nfolders kept: {folder}")
         differing = differences(outcome(folder / "whole"), outcome(folder / "killed"))
         verdict = f"DIFFERENT in {differing}" if differing else "same"

@@ -3,22 +3,19 @@
 import io
 import itertools
 import math
-import signal
-import sys
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from conftest import make_agent
 from gymnasium.spaces import Box
 from sklearn.metrics import explained_variance_score
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from torch import nn
+from test_commands import QUICK, call_main, read_events
 
 import ppo_continuous
 import refineppo_continuous
 
-SCHEDULES = ("average", "uniform", "inverse")
 COEFFICIENTS = {
     ("average", 1): [1.0],
     ("uniform", 1): [1.0],
@@ -32,19 +29,14 @@ COEFFICIENTS = {
 }
 
 
-def make_agent(script, obs_dim=3, action_dim=2, **flags):
-    return script.Agent(Box(-1, 1, (obs_dim,)), Box(-1, 1, (action_dim,)), script.Args(**flags))
-
-
-def agent_for(script, env_id, **flags):
-    env = gym.make(env_id)
-    return script.Agent(env.observation_space, env.action_space, script.Args(env_id=env_id, **flags))
+def agent_and_envs(script, env_id, **flags):
+    training = script.Training(script.Args(env_id=env_id, **flags))
+    return training.agent, training.envs
 
 
 def copies(agent):
     """Everything in an agent that training changes."""
-    parts = agent.tensors()
-    return {f"{part}.{name}": x.clone() for part, tensors in parts.items() for name, x in tensors.items()}
+    return {(part, name): x.clone() for part, tensors in agent.state().items() for name, x in tensors.items()}
 
 
 def assert_same(before, after):
@@ -76,74 +68,67 @@ def refine(weights, obs, coefficients):
     return proposals
 
 
-def refining_actor(schedule, depth, hidden=(8, 8), obs_dim=3, action_dim=2):
-    args = refineppo_continuous.Args(refinement_depth=depth, refinement_schedule=schedule, actor_hidden=hidden)
-    return refineppo_continuous.Actor(obs_dim, action_dim, args)
-
-
 @pytest.mark.parametrize("schedule, depth", COEFFICIENTS)
 def test_refinement_coefficients(schedule, depth):
-    assert refineppo_continuous.refinement_coefficients(schedule, depth) == COEFFICIENTS[schedule, depth]
+    args = refineppo_continuous.Args(refinement_depth=depth, refinement_schedule=schedule)
+    assert refineppo_continuous.refinement_coefficients(args) == COEFFICIENTS[schedule, depth]
 
 
 @pytest.mark.parametrize("hidden", [(8,), (8, 8), (16, 8, 4)])
 @pytest.mark.parametrize("schedule, depth", COEFFICIENTS)
 def test_proposals_against_plain_loop(schedule, depth, hidden):
-    actor = refining_actor(schedule, depth, hidden)
     weights, obs = random_network([5, *hidden, 2]), np.random.default_rng(1).normal(size=(7, 3))
-    expected = refine(weights, obs, COEFFICIENTS[schedule, depth])
-    in_tensors = actor.proposals([tuple(map(torch.tensor, layer)) for layer in weights], torch.tensor(obs))
-    for proposals in (actor.proposals(weights, obs), [m.numpy() for m in in_tensors]):
+    coefficients, tensors = COEFFICIENTS[schedule, depth], [tuple(map(torch.tensor, layer)) for layer in weights]
+    expected = refine(weights, obs, coefficients)
+    in_tensors = refineppo_continuous.proposals(tensors, coefficients, torch.tensor(obs))
+    for proposals in (refineppo_continuous.proposals(weights, coefficients, obs), [m.numpy() for m in in_tensors]):
         assert len(proposals) == depth
         np.testing.assert_allclose(proposals, expected, rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(actor.mean(weights, obs), actor.proposals(weights, obs)[-1])
-    np.testing.assert_allclose(actor.mean(weights, obs[:1]), expected[-1][:1], rtol=0, atol=1e-12)
+    single = refineppo_continuous.proposals(weights, coefficients, obs[:1])
+    np.testing.assert_allclose(single[-1], expected[-1][:1], rtol=0, atol=1e-12)
 
 
 def test_one_step_is_f_of_s_and_0():
-    """Proposition 1: for K = 1 every schedule is the same direct mapping."""
+    """Proposition 1: for K = 1 every schedule, each of c_1 = 1, is the same direct mapping."""
     weights, obs = random_network([5, 8, 8, 2]), np.random.default_rng(1).normal(size=(7, 3))
-    means = [refining_actor(schedule, 1).mean(weights, obs) for schedule in SCHEDULES]
-    np.testing.assert_array_equal(means[0], means[1])
-    np.testing.assert_array_equal(means[0], means[2])
-    np.testing.assert_allclose(means[0], network(weights, np.c_[obs, np.zeros((7, 2))]), rtol=0, atol=1e-12)
+    (m_1,) = refineppo_continuous.proposals(weights, [1.0], obs)
+    np.testing.assert_allclose(m_1, network(weights, np.c_[obs, np.zeros((7, 2))]), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("schedule, depth", [key for key in COEFFICIENTS if key[1] > 1] + [("average", 1)])
 def test_gradient_of_the_chain_against_finite_differences(schedule, depth):
     """Central differences of the plain loop, for every parameter: the gradient flows through all K steps."""
-    weights, rng = random_network([5, 4, 4, 2]), np.random.default_rng(1)
-    obs, direction = rng.normal(size=(6, 3)), rng.normal(size=(6, 2))
-    parameters = [x for layer in weights for x in layer]
+    shapes, rng, h = ((5, 4), (4,), (4, 4), (4,), (4, 2), (2,)), np.random.default_rng(1), 1e-6
+    starts = np.cumsum([0, *map(math.prod, shapes)])
+    x, obs, direction = (rng.normal(size=size) for size in (starts[-1], (6, 3), (6, 2)))
 
-    def objective():
-        return (direction * refine(weights, obs, COEFFICIENTS[schedule, depth])[-1]).sum()
+    def m_K(function, x, obs):
+        parts = [x[a:b].reshape(shape) for a, b, shape in zip(starts, starts[1:], shapes)]
+        return function(list(zip(parts[::2], parts[1::2])), obs, COEFFICIENTS[schedule, depth])[-1]
 
-    def in_tensors(*tensors):
-        mean = refining_actor(schedule, depth, (4, 4)).mean(list(zip(tensors[::2], tensors[1::2])), torch.tensor(obs))
-        return (torch.tensor(direction) * mean).sum()
-
-    tensors = [torch.tensor(x, requires_grad=True) for x in parameters]
-    gradients = torch.autograd.grad(in_tensors(*tensors), tensors)
-    h = 1e-6
-    for parameter, gradient in zip(parameters, gradients):
-        for i in np.ndindex(parameter.shape):
-            value = parameter[i]
-            parameter[i] = value + h
-            above = objective()
-            parameter[i] = value - h
-            below = objective()
-            parameter[i] = value
-            assert gradient[i].item() == pytest.approx((above - below) / (2 * h), rel=1e-6, abs=1e-8)
-    assert torch.autograd.gradcheck(in_tensors, tensors)
+    tensor = torch.tensor(x, requires_grad=True)
+    mean = m_K(lambda weights, obs, c: refineppo_continuous.proposals(weights, c, obs), tensor, torch.tensor(obs))
+    (torch.tensor(direction) * mean).sum().backward()
+    slopes = [(m_K(refine, x + step, obs) - m_K(refine, x - step, obs)) / (2 * h) for step in h * np.eye(len(x))]
+    np.testing.assert_allclose(tensor.grad, (direction * slopes).sum((1, 2)), rtol=1e-6, atol=1e-8)
 
 
 def test_refinement_scalars_by_hand():
-    m_1 = torch.tensor([[3.0, 4.0], [1.0, 0.0]])
-    m_2 = torch.tensor([[3.0, 4.0], [5.0, -3.0]])
-    low, high = torch.tensor([-2.0, -2.0]), torch.tensor([4.0, 3.5])
-    scalars = refineppo_continuous.refinement_scalars([m_1, m_2], low, high)
-    assert scalars == pytest.approx(
+    """A saturated layer tells (s, m) = (1, m_0), (1, m_1), (-1, m_0) and (-1, m_1) apart; an eighth of the rows counts.
+
+    For s = 1: m_1 = m_2 = (3, 4); for s = -1: m_1 = (1, 0), m_2 = (5, -3).
+    """
+    flags = {"refinement_depth": 2, "refinement_schedule": "uniform", "actor_hidden": (3,)}
+    agent = make_agent(refineppo_continuous, obs_dim=1, action_dim=2, **flags)
+    agent.low, agent.high = np.array([-2.0, -2.0], "f"), np.array([4.0, 3.5], "f")
+    signs = torch.tensor([[1.0, -1, -1, 1], [1, 1, 1, 1], [-1, -1, -1, 1], [-1, 1, -1, 1]])  # of s, m_x - 0.5, m_x - 2
+    corrections = torch.linalg.solve(signs, torch.tensor([[3.0, 4], [0, 0], [1, 0], [4, -3]]))
+    agent.params["actor.0.weight"][:] = 100 * torch.tensor([[1.0, 0, 0], [0, 1, 1], [0, 0, 0]])
+    agent.params["actor.0.bias"][:] = 100 * torch.tensor([0, -0.5, -2])
+    agent.params["actor.1.weight"][:], agent.params["actor.1.bias"][:] = corrections[:3], corrections[3]
+    obs = torch.full((16, 1), 9.0)
+    obs[0], obs[8] = 1, -1
+    assert refineppo_continuous.refinement_scalars(agent, obs) == pytest.approx(
         {
             "refinement/correction_norm_1": (5 + 1) / 2,
             "refinement/correction_norm_2": (0 + 5) / 2,
@@ -151,40 +136,12 @@ def test_refinement_scalars_by_hand():
             "refinement/settling_error_2": 0,
             "refinement/outside_bounds_1": 1 / 2,
             "refinement/outside_bounds_2": 1,
-        }
+        },
+        abs=1e-5,
     )
 
 
 # --- Networks and their initial values --------------------------------------------------------------------------------
-
-
-def sequential(weights):
-    """The same network in torch's modules, which store (out, in)."""
-    modules = []
-    for w, b in weights:
-        linear = nn.Linear(*w.shape, dtype=w.dtype)
-        linear.weight.data, linear.bias.data = w.T.clone(), b.clone()
-        modules += [linear, nn.Tanh()]
-    return nn.Sequential(*modules[:-1])
-
-
-@pytest.mark.parametrize("hidden", [(8,), (8, 8), (16, 8, 4)])
-def test_ppo_actor_against_torch_modules(hidden):
-    weights, obs = random_network([3, *hidden, 2]), np.random.default_rng(1).normal(size=(7, 3))
-    actor = ppo_continuous.Actor(3, 2, ppo_continuous.Args(actor_hidden=hidden))
-    in_tensors = [tuple(map(torch.tensor, layer)) for layer in weights]
-    expected = sequential(in_tensors)(torch.tensor(obs))
-    torch.testing.assert_close(actor.mean(in_tensors, torch.tensor(obs)), expected, rtol=0, atol=1e-12)
-    torch.testing.assert_close(torch.tensor(actor.mean(weights, obs)), expected, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("hidden", [(8,), (8, 8), (16, 8, 4)])
-def test_critic_against_torch_modules(script, hidden):
-    weights = [tuple(map(torch.tensor, layer)) for layer in random_network([3, *hidden, 1])]
-    obs = torch.tensor(np.random.default_rng(1).normal(size=(7, 3)))
-    values = script.critic_value(weights, obs)
-    assert values.shape == (7,)
-    torch.testing.assert_close(values, sequential(weights)(obs)[:, 0], rtol=0, atol=1e-12)
 
 
 def test_initial_parameters(script):
@@ -204,20 +161,6 @@ def test_initial_parameters(script):
     same, other = (make_agent(script, obs_dim=5, action_dim=3, seed=seed, log_std_init=-0.5) for seed in (4, 5))
     assert_same(agent.params, same.params)
     assert all(agent.params[name].ne(other.params[name]).all() for name in agent.params if name.endswith("weight"))
-
-
-def test_actor_is_the_same_in_arrays_and_tensors(script):
-    agent, rng = make_agent(script, obs_dim=17, action_dim=6), np.random.default_rng(0)
-    for p in agent.params.values():
-        p += torch.tensor(0.1 * rng.normal(size=p.shape))
-    for dtype, tolerance in ((torch.float32, 1e-5), (torch.float64, 1e-6)):
-        agent.params = {name: p.to(dtype) for name, p in agent.params.items()}
-        for batch_size in (1, 64):
-            obs = torch.tensor(rng.normal(size=(batch_size, 17)), dtype=dtype)
-            in_arrays = agent.actor.mean(script.layers(agent.arrays(), "actor"), obs.numpy())
-            in_tensors = agent.actor.mean(script.layers(agent.params, "actor"), obs)
-            scale = in_tensors.abs().max().item()
-            np.testing.assert_allclose(in_arrays, in_tensors.numpy(), rtol=0, atol=tolerance * scale)
 
 
 # --- Advantages and the batch -----------------------------------------------------------------------------------------
@@ -269,10 +212,10 @@ def test_batch_by_hand(script, env, last_step, bootstrap):
     """A truncation bootstraps gamma V(final observation) if asked to, a termination never."""
     gamma, decay, steps = 0.9, 0.9 * 0.8, 12
     flags = dict(gamma=0.9, gae_lambda=0.8, normalize_obs=False, normalize_reward=False, critic_hidden=(1,))
-    agent = agent_for(script, f"probe_envs:{env}-v0", num_steps=steps, bootstrap_truncated=bootstrap, **flags)
+    flags |= dict(num_steps=steps, bootstrap_truncated=bootstrap)
+    agent, envs = agent_and_envs(script, f"probe_envs:{env}-v0", **flags)
     set_critic(agent)
-    envs = script.Environments(agent.args.env_id, 1, seed=1)
-    roll = script.collect(agent, envs, agent.normalizer.observe(envs.obs), steps, np.random.default_rng(0))
+    roll = script.collect(agent, envs, steps, np.random.default_rng(0))
 
     counts = [t % last_step for t in range(steps + 1)]  # the observations
     value = [3 * math.tanh(n / 2) + 1 for n in range(last_step + 1)]
@@ -287,11 +230,11 @@ def test_batch_by_hand(script, env, last_step, bootstrap):
 
     values = [value[n] for n in counts[:-1]]
     expected_returns = np.add(advantages[:-1], values)
-    (obs, actions, logprobs, *rest), explained_variance = script.prepare_batch(agent, roll)
-    np.testing.assert_array_equal(obs[:, 0], counts[:-1])
-    np.testing.assert_array_equal(actions, roll.actions[:, 0])
-    np.testing.assert_array_equal(logprobs, roll.logprobs[:, 0])
-    for tensor, expected in zip(rest, (advantages[:-1], expected_returns, values), strict=True):
+    batch, explained_variance = script.prepare_batch(agent, roll)
+    np.testing.assert_array_equal(batch.obs[:, 0], counts[:-1])
+    np.testing.assert_array_equal(batch.actions, roll.actions[:, 0])
+    np.testing.assert_array_equal(batch.logprobs, roll.logprobs[:, 0])
+    for tensor, expected in zip(batch[3:], (advantages[:-1], expected_returns, values), strict=True):
         np.testing.assert_allclose(tensor, expected, rtol=1e-5)
     assert explained_variance == pytest.approx(explained_variance_score(expected_returns, values), rel=1e-5)
 
@@ -299,32 +242,33 @@ def test_batch_by_hand(script, env, last_step, bootstrap):
 def test_batch_of_several_environments(script):
     """Rows keep together, step by step; rewards are scaled first and bootstrapped then; a termination at the time
     limit is a termination."""
-    agent = make_agent(script, obs_dim=1, action_dim=2, num_envs=3, num_steps=4, bootstrap_truncated=True,
-                       critic_hidden=(1,), gamma=0.9)  # fmt: skip
+    flags = dict(num_envs=3, num_steps=4, bootstrap_truncated=True, critic_hidden=(1,), gamma=0.9)
+    agent = make_agent(script, obs_dim=1, action_dim=2, **flags)
     set_critic(agent)
     rng = np.random.default_rng(0)
     obs, actions, logprobs = (rng.normal(size=s).astype("f") for s in ((5, 3, 1), (4, 3, 2), (4, 3)))
     rewards, terminated, truncated = rng.normal(size=(4, 3)), np.zeros((4, 3), bool), np.zeros((4, 3), bool)
     terminated[1, 0] = terminated[2, 1] = truncated[2, 1] = truncated[1, 2] = True
     last = {end: np.array([0.7], "f") for end in ((1, 0), (2, 1), (1, 2))}
-    roll = script.Rollout(obs=obs, next_obs=obs[1:], actions=actions, logprobs=logprobs, rewards=rewards.copy(),
-                          terminated=terminated, truncated=truncated, final_obs=last, first_obs={},
-                          episodes=[])  # fmt: skip
+    roll = script.Rollout(obs, actions, logprobs, rewards.copy(), terminated, truncated, last, episodes=[])
     expected_rewards = script.Normalizer(3, 1, agent.args).scale_rewards(rewards, terminated)
     expected_rewards[1, 2] += 0.9 * (3 * math.tanh(0.7 / 2) + 1)
     values = 3 * np.tanh(obs[..., 0] / 2) + 1
     advantages = script.gae(expected_rewards, values, terminated | truncated, 0.9, 0.95)
 
     batch, _ = script.prepare_batch(agent, roll)
-    columns = (obs[:-1], actions, logprobs, advantages, advantages + values[:-1], values[:-1])
-    for tensor, expected in zip(batch, columns, strict=True):
-        assert tensor.dtype == torch.float32
-        for t in range(4):
-            for i in range(3):
-                np.testing.assert_allclose(tensor[3 * t + i], expected[t, i], rtol=1e-5, atol=1e-6)
+    assert isinstance(batch, script.Batch)
+    columns = dict(obs=obs[:-1], actions=actions, logprobs=logprobs, advantages=advantages)
+    columns |= dict(returns=advantages + values[:-1], values=values[:-1])
+    assert batch._fields == tuple(columns)
+    for name, expected in columns.items():
+        tensor = getattr(batch, name)
+        assert tensor.dtype == torch.float32 and tensor.shape == (12, *expected.shape[2:])
+        for row, (t, i) in zip(tensor, np.ndindex(4, 3)):
+            np.testing.assert_allclose(row, expected[t, i], rtol=1e-5, atol=1e-6)
 
 
-# --- Normaliser -------------------------------------------------------------------------------------------------------
+# --- Normalizer -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -338,9 +282,8 @@ def test_batch_of_several_environments(script):
 )
 def test_observations_against_gymnasiums_wrapper(script, env_id, steps, tolerance):
     """Statistics and order of counting: an episode's last observation, then the next one's first."""
-    agent = agent_for(script, env_id)
-    envs = script.Environments(env_id, 1, seed=3)
-    roll = script.collect(agent, envs, agent.normalizer.observe(envs.obs), steps, np.random.default_rng(0))
+    agent, envs = agent_and_envs(script, env_id, seed=3)
+    roll = script.collect(agent, envs, steps, np.random.default_rng(0))
     assert len(roll.episodes) >= 4
 
     env = gym.wrappers.NormalizeObservation(gym.make(env_id))
@@ -446,9 +389,9 @@ def test_normalisation_off(script):
 
 
 def test_normalizer_tensors_share_its_memory(script):
-    """A checkpoint's tensors are the normaliser's own numbers, in both directions."""
+    """A checkpoint's tensors are the normalizer's own numbers, in both directions."""
     normalizer = script.Normalizer(2, 3, script.Args())
-    tensors = normalizer.tensors()
+    tensors = normalizer.state()
     before = {name: x.clone() for name, x in tensors.items()}
     normalizer.observe(np.random.default_rng(0).normal(size=(2, 3)))
     normalizer.scale_rewards(np.ones((3, 2)), np.zeros((3, 2), bool))
@@ -473,7 +416,7 @@ def random_actions(env_id, steps, num_envs):
 )
 def test_environments_against_plain_loop(script, env_id, steps):
     """Every episode as if played alone, in an environment of its own with the episode's seed."""
-    envs, actions = script.Environments(env_id, 2, seed=5), random_actions(env_id, steps, 2)
+    envs, actions = script.Environments(script.Args(env_id, num_envs=2, seed=5)), random_actions(env_id, steps, 2)
     first_obs = envs.obs.copy()
     outcomes = []
     for t in range(steps):
@@ -514,12 +457,12 @@ def test_environments_against_plain_loop(script, env_id, steps):
 )
 def test_environments_replay_exactly(script, env_id, steps):
     """Loaded into new environments, a saved state goes on bit for bit, over the episodes' ends."""
-    actions, seed = random_actions(env_id, steps + 250, 2), 9
-    envs = script.Environments(env_id, 2, seed)
+    actions, args = random_actions(env_id, steps + 250, 2), script.Args(env_id, num_envs=2, seed=9)
+    envs = script.Environments(args)
     assert any(envs.step(actions[t])[4] for t in range(steps))
     buffer = io.BytesIO()
     torch.save(envs.state(), buffer)
-    again = script.Environments(env_id, 2, seed)
+    again = script.Environments(args)
     again.load(torch.load(io.BytesIO(buffer.getvalue()), weights_only=True))
     np.testing.assert_array_equal(again.obs, envs.obs)
     for t in range(steps, steps + 250):
@@ -536,17 +479,16 @@ def test_environments_replay_exactly(script, env_id, steps):
 @pytest.mark.parametrize("num_envs", [1, 3])
 def test_rollouts_of_a_counter_by_hand(script, num_envs):
     """Two rollouts of 11 steps through episodes of 7: one episode ends in each, the second begins in the first."""
-    agent = agent_for(script, "probe_envs:Counter-v0", num_envs=num_envs, normalize_obs=False)
-    envs, rng = script.Environments("probe_envs:Counter-v0", num_envs, seed=1), np.random.default_rng(0)
-    first = script.collect(agent, envs, agent.normalizer.observe(envs.obs), 11, rng)
-    second = script.collect(agent, envs, first.obs[-1], 11, rng)
+    agent, envs = agent_and_envs(script, "probe_envs:Counter-v0", num_envs=num_envs, normalize_obs=False)
+    rng = np.random.default_rng(0)
+    first, second = script.collect(agent, envs, 11, rng), script.collect(agent, envs, 11, rng)
     for roll, counts, rewards, ends in (
         (first, [0, 1, 2, 3, 4, 5, 6, 0, 1, 2, 3, 4], [1, 2, 3, 4, 5, 6, 7, 1, 2, 3, 4], [6]),
         (second, [4, 5, 6, 0, 1, 2, 3, 4, 5, 6, 0, 1], [5, 6, 7, 1, 2, 3, 4, 5, 6, 7, 1], [2, 9]),
     ):
         for i in range(num_envs):
             assert roll.obs[:, i, 0].tolist() == counts
-            assert roll.rewards[:, i].tolist() == roll.next_obs[:, i, 0].tolist() == rewards
+            assert roll.rewards[:, i].tolist() == rewards
             assert np.flatnonzero(roll.truncated[:, i]).tolist() == ends
         assert not roll.terminated.any()
         assert {key: obs.tolist() for key, obs in roll.final_obs.items()} == {
@@ -556,9 +498,8 @@ def test_rollouts_of_a_counter_by_hand(script, num_envs):
 
 
 def test_actions_are_clipped_for_the_environment_only(script, monkeypatch):
-    agent = agent_for(script, "Pendulum-v1", num_envs=2, log_std_init=1.0)
-    agent.params["actor.2.weight"] *= 100  # a mean that depends visibly on the observation
-    envs, executed, obs_seen = script.Environments("Pendulum-v1", 2, seed=1), [], []
+    agent, envs = agent_and_envs(script, "Pendulum-v1", num_envs=2, log_std_init=1.0)
+    executed, obs_seen = [], [envs.obs.copy()]
 
     def step(actions, original=envs.step):
         executed.append(actions.copy())
@@ -567,45 +508,46 @@ def test_actions_are_clipped_for_the_environment_only(script, monkeypatch):
         return obs, *rest
 
     monkeypatch.setattr(envs, "step", step)
-    first = agent.normalizer.observe(envs.obs)
-    roll = script.collect(agent, envs, first, 50, np.random.default_rng(0))
+    roll = script.collect(agent, envs, 50, np.random.default_rng(0))
     assert (np.abs(roll.actions) > 2).mean() > 0.2
     np.testing.assert_array_equal(executed, np.clip(roll.actions, -2, 2))
-
     replayed = script.Normalizer(2, 3, agent.args)
-    np.testing.assert_array_equal(roll.obs[0], replayed.observe(script.Environments("Pendulum-v1", 2, seed=1).obs))
-    for t in range(50):
-        np.testing.assert_array_equal(roll.obs[t + 1], replayed.observe(obs_seen[t]))
-
-    mean = agent.actor.mean(script.layers(agent.params, "actor"), torch.tensor(roll.obs[:-1].reshape(100, 3)))
-    policy = torch.distributions.Normal(mean, agent.params["log_std"].exp())
-    logprobs = policy.log_prob(torch.tensor(roll.actions.reshape(100, 1))).sum(1)
-    np.testing.assert_allclose(roll.logprobs.reshape(100), logprobs, rtol=0, atol=1e-4)
+    for seen, raw in zip(roll.obs, obs_seen, strict=True):
+        np.testing.assert_array_equal(seen, replayed.observe(raw))
 
 
 # --- Learning rate ----------------------------------------------------------------------------------------------------
 
 
 def test_adam_step_sizes_by_hand(script):
-    sizes = script.adam_step_sizes(0.1, first=1, count=3)
+    adam = script.Adam({})
+    sizes = adam.step_sizes(0.1, count=3)
     expected = [[1.0, 31.6227766], [0.526315789, 22.3662720], [0.369003690, 18.2665511]]
-    np.testing.assert_allclose(sizes, expected, rtol=1e-8)
-    np.testing.assert_array_equal(script.adam_step_sizes(0.1, first=3, count=1)[0], sizes[2])
+    np.testing.assert_allclose(sizes, expected, rtol=1e-7)
+    adam.steps = 2
+    np.testing.assert_array_equal(adam.step_sizes(0.1, count=1)[0], sizes[2])
 
 
-def test_learning_rate_is_annealed_as_in_cleanrl(script, tmp_path, monkeypatch):
+def test_learning_rate_is_annealed_as_in_cleanrl(script, tmp_path):
     """(1 - (iteration - 1) / num_iterations) lr, where an incomplete last rollout is no iteration."""
-    flags = "--env-id probe_envs:Counter-v0 --num-steps 8 --num-minibatches 2 --update-epochs 1 --total-timesteps 35"
-    flags += " --learning-rate 0.004 --eval-episodes 1 --final-eval-episodes 1 --no-compile --no-progress"
-    monkeypatch.setattr(sys, "argv", [script.__file__, *flags.split(), "--run-dir", str(tmp_path / "run")])
-    monkeypatch.setattr(signal, "signal", lambda *_: None)
-    script.main()
-    events = EventAccumulator(str(tmp_path / "run")).Reload().Scalars("charts/learning_rate")
+    flags = "--env-id probe_envs:Counter-v0 --num-steps 8 --total-timesteps 35 --learning-rate 0.004 --no-progress"
+    call_main(script, *QUICK, *flags.split(), "--run-dir", tmp_path)
+    events = read_events(tmp_path).Scalars("charts/learning_rate")
     assert [event.step for event in events] == [8, 16, 24, 32]
     assert [event.value for event in events] == pytest.approx([0.004, 0.003, 0.002, 0.001])
 
 
 # --- Evaluation -------------------------------------------------------------------------------------------------------
+
+
+def rewards_of_an_episode(env: gym.Env, agent, seed: int) -> list[float]:
+    """A loop of one's own over `act`, which test_agent.py compares with a plain loop over the network."""
+    (obs, _), rewards, ended = env.reset(seed=seed), [], False
+    while not ended:
+        obs, reward, terminated, truncated, _ = env.step(agent.act(obs))
+        rewards.append(reward)
+        ended = terminated or truncated
+    return rewards
 
 
 class Watched(gym.Wrapper):
@@ -628,50 +570,28 @@ class Watched(gym.Wrapper):
 @pytest.mark.parametrize("env_id", ["Hopper-v5", "LunarLanderContinuous-v3", "probe_envs:Terminator-v0"])
 def test_evaluation_against_plain_loop(script, monkeypatch, env_id):
     """One deterministic episode per seed, and nothing of the training is touched."""
-    agent = agent_for(script, env_id, num_envs=2)
-    agent.params = {name: p.double() for name, p in agent.params.items()}  # so that rounding cannot grow visible
+    agent, envs = agent_and_envs(script, env_id, num_envs=2)
     agent.params["actor.2.weight"] *= 50
-    envs = script.Environments(env_id, 2, seed=1)
-    script.collect(agent, envs, agent.normalizer.observe(envs.obs), 100, np.random.default_rng(0))
-    seeds, make_env = [11, 7, 11, 13], script.make_env
+    script.collect(agent, envs, 100, np.random.default_rng(0))
+    seeds, make_env, before = [11, 7, 11, 13], script.make_env, copies(agent)
     monkeypatch.setattr(Watched, "resets", [])
-    monkeypatch.setattr(script, "make_env", lambda *args: Watched(make_env(*args)))
-    before, generators = copies(agent), (torch.get_rng_state(), np.random.get_state())
+    monkeypatch.setattr(script, "make_env", lambda *args, **facts: Watched(make_env(*args, **facts)))
     returns, lengths = script.evaluate(agent, seeds)
     assert Watched.resets == seeds
     assert_same(before, copies(agent))
-    assert torch.equal(torch.get_rng_state(), generators[0])
-    assert str(np.random.get_state()) == str(generators[1])
-
-    mean, std = agent.normalizer.obs.mean, np.sqrt(agent.normalizer.obs.squares / agent.normalizer.obs.count + 1e-8)
     for seed, episode_return, length in zip(seeds, returns, lengths, strict=True):
-        env, rewards, ended = gym.make(env_id), [], False
-        obs, _ = env.reset(seed=seed)
-        while not ended:
-            normalised = np.clip((obs - mean) / std, -10, 10).astype("f").astype(float)[None]
-            action = agent.actor.mean(script.layers(agent.params, "actor"), torch.tensor(normalised))[0].numpy()
-            action = np.clip(action, env.action_space.low, env.action_space.high)
-            obs, reward, terminated, truncated, _ = env.step(action)
-            rewards.append(reward)
-            ended = terminated or truncated
-        assert length == len(rewards)
-        assert episode_return == pytest.approx(sum(rewards), rel=1e-6)
+        rewards = rewards_of_an_episode(gym.make(env_id), agent, seed)
+        assert (episode_return, length) == (sum(rewards), len(rewards))
     assert returns[0] == returns[2]
 
 
 def test_evaluation_seeds():
+    """The same of both scripts; no two evaluations share one; a C int holds them."""
     used = {}
-    for seed in (1, 2):
-        for step in range(100_000, 2_000_001, 100_000):
-            for final in (False, True):
-                seeds = refineppo_continuous.evaluation_seeds(
-                    refineppo_continuous.Args(seed=seed, eval_episodes=10, final_eval_episodes=7), step, final
-                )
-                same = ppo_continuous.evaluation_seeds(
-                    ppo_continuous.Args(seed=seed, eval_episodes=10, final_eval_episodes=7), step, final
-                )
-                assert seeds == same
-                assert len(seeds) == (7 if final else 10)
-                assert all(s % 2 == final for s in seeds)
-                used[seed, step, final] = set(seeds)
+    for seed, step, final in itertools.product((1, 2), range(100_000, 2_000_001, 100_000), (False, True)):
+        flags = {"seed": seed, "eval_episodes": 10, "final_eval_episodes": 7}
+        seeds, same = (m.evaluation_seeds(m.Args(**flags), step, final) for m in (ppo_continuous, refineppo_continuous))
+        assert seeds == same and len(seeds) == (7 if final else 10)
+        assert all(s % 2 == final and 0 <= s < 2**31 for s in seeds)
+        used[seed, step, final] = set(seeds)
     assert sum(map(len, used.values())) == len(set.union(*used.values())) == 2 * 20 * 17

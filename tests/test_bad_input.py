@@ -1,10 +1,7 @@
-"""Bad input ends with exit code 2 and one sentence before any work; numbers that are not finite with exit code 3."""
+"""Bad input ends with exit code 2 and one sentence before any work."""
 
-import json
 import zipfile
 
-import gymnasium as gym
-import numpy as np
 import pytest
 import torch
 from conftest import run
@@ -22,8 +19,6 @@ REFUSED = [
     ("--env-id probe_envs:NoSuchTask-v0", "NoSuchTask"),
     ("--env-id CartPole-v1", "actions"),
     ("--env-id probe_envs:Discrete-v0", "actions"),
-    ("--env-id probe_envs:ImageObs-v0", "observations"),
-    ("--env-id probe_envs:DictObs-v0", "observations"),
     ("--num-minibatches 3", "3 minibatches"),
     ("--num-envs 3 --num-minibatches 5 --total-timesteps 1000", "96 steps"),
     ("--num-minibatches 64", "minibatch"),
@@ -50,10 +45,14 @@ REFUSED = [
     ("--critic-hidden -4", "--critic-hidden"),
     *((f"--{name} 0", f"--{name}") for name in "total-timesteps num-envs num-steps num-minibatches".split()),
     *((f"--{name} 0", f"--{name}") for name in "update-epochs eval-interval eval-episodes save-every".split()),
-    *((f"--{name} 0", f"--{name}") for name in "final-eval-episodes checkpoint-interval num-threads".split()),
+    *(
+        (f"--{name} 0", f"--{name}")
+        for name in "final-eval-episodes checkpoint-interval num-threads max-episode-steps".split()
+    ),
     ("--num-envs -2 --num-steps -16", "--num-envs"),
     ("--seed -1", "--seed"),
     ("--seed 99999999999999999999", "--seed"),
+    ("--resume", "--run-dir"),
     ("--render", "--evaluate"),
     ("--evaluate no/such.pt", "no/such.pt"),
     ("--evaluate .", "checkpoint"),
@@ -118,10 +117,6 @@ def test_unknown_schedule(folder, capsys):
     assert list(folder.iterdir()) == []
 
 
-def test_resume_without_a_folder(refuses):
-    assert "--run-dir" in refuses("--resume")
-
-
 def test_no_gpu(refuses, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert "--cuda" in refuses("--cuda")
@@ -176,28 +171,17 @@ def a_folder(path):
     path.mkdir()
 
 
-def other_parts(path, **parts):
-    torch.save(torch.load(path) | parts, path)
-
-
 def no_parameters(path):
-    other_parts(path, params={})
+    torch.save(torch.load(path) | {"params": {}}, path)
 
 
 def small_parameters(path):  # which would fill the right ones, if copied into them
-    other_parts(path, params={name: torch.ones(1) for name in torch.load(path)["params"]})
-
-
-def text_for_a_number(path):
-    other_parts(path, args=torch.load(path)["args"] | {"num_envs": "3"})
-
-
-def text_for_the_step(path):
-    other_parts(path, global_step="many")
+    checkpoint = torch.load(path)
+    torch.save(checkpoint | {"params": {name: torch.ones(1) for name in checkpoint["params"]}}, path)
 
 
 NO_CHECKPOINTS = torn, text, another_zip, another_model, a_tensor, a_folder
-MALFORMED = no_parameters, small_parameters, text_for_a_number, text_for_the_step
+MALFORMED = no_parameters, small_parameters
 
 
 @pytest.mark.parametrize("damage", [*NO_CHECKPOINTS, *MALFORMED], ids=lambda damage: damage.__name__)
@@ -219,6 +203,7 @@ def test_evaluating_a_checkpoint_of_the_other_script(refuses, script, folder, ca
 OLD_TASK = "--env-id LunarLanderContinuous-v2"  # gymnasium also warns of its age
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flags", [OLD_TASK, "--num-threads 0", "--run-dir /dev/null/run", "--evaluate no/such.pt"])
 def test_real_commands(script, flags, tmp_path):
     done = run(f"{script.__name__}.py", *flags.split(), cwd=tmp_path)
@@ -226,82 +211,3 @@ def test_real_commands(script, flags, tmp_path):
     (line,) = done.stderr.splitlines()
     assert line.startswith(f"{script.__name__}.py: error: ")
     assert list(tmp_path.iterdir()) == []
-
-
-# --- Numbers that are not finite --------------------------------------------------------------------------------------
-
-
-def read_failure(run_dir) -> dict:
-    """failure.json, in strict JSON, of a run that is not complete."""
-    assert not (run_dir / "result.json").exists()
-    return json.loads((run_dir / "failure.json").read_text(), parse_constant=pytest.fail)
-
-
-def check_checkpoints(run_dir, step: int):
-    """The checkpoints from before the failure load and are sound."""
-    for name, saved in (("last.pt", {step}), ("best.pt", range(1, step + 1))):
-        checkpoint = torch.load(run_dir / name, weights_only=True)
-        assert checkpoint["global_step"] in saved
-        tensors = [*checkpoint["params"].values(), *checkpoint["normalizer"].values()]
-        assert all(tensor.isfinite().all() for tensor in tensors)
-
-
-KEEP_ALL = ("--checkpoint-interval", 1, "--eval-interval", 1)
-
-
-@pytest.mark.parametrize("env, name, value", [("NanReward", "reward", "nan"), ("InfReward", "reward", "inf"),
-                                              ("NanObs", "next_obs", "nan")])  # fmt: skip
-def test_environment_that_goes_wrong(script, env, name, value, tmp_path):
-    flags = ("--num-envs", 2, "--total-timesteps", 640, "--run-dir", tmp_path / "run")
-    done = run(f"{script.__name__}.py", *QUICK, *KEEP_ALL, "--env-id", f"probe_envs:{env}-v0", *flags)
-    assert done.returncode == 3
-    # both environments fail at their 101st step, in the fourth rollout of 64 steps
-    failure = read_failure(tmp_path / "run")
-    assert (failure["global_step"], failure["env"]) == (202, 0)
-    assert value in failure[name] and "[" in failure["action"]
-    (line,) = done.stderr.splitlines()
-    assert failure["what"] in line and "202" in line and value in line and "failure.json" in line
-    check_checkpoints(tmp_path / "run", step=192)
-
-
-def test_first_observation_that_is_not_finite(script, tmp_path):
-    """The third copy of the task is the second environment; its third episode begins after 2 x 50 steps in each."""
-    flags = ("--num-envs", 2, "--total-timesteps", 640, "--run-dir", tmp_path / "run")
-    done = run(f"{script.__name__}.py", *QUICK, *KEEP_ALL, "--env-id", "probe_envs:NanFirstObs-v0", *flags)
-    failure = read_failure(tmp_path / "run")
-    assert (done.returncode, failure["global_step"], failure["env"], failure["first_obs"]) == (3, 200, 1, "[nan]")
-
-
-@pytest.mark.parametrize("env, step", [("NanObs", 102), ("NanReward", 101)])
-def test_evaluation_that_is_not_finite(script, env, step, monkeypatch):
-    """An episode's return is NaN as soon as an observation or a reward is, though the other stays sound."""
-    task = gym.make(f"probe_envs:{env}-v0", max_episode_steps=step)
-    args = script.Args(env_id=f"probe_envs:{env}-v0", actor_hidden=(8,), critic_hidden=(8,))
-    agent = script.Agent(task.observation_space, task.action_space, args)
-    monkeypatch.setattr(script, "make_env", lambda *_: gym.make(args.env_id, max_episode_steps=step - 1))
-    assert np.isfinite(script.evaluate(agent, [0, 2])[0]).all()
-    monkeypatch.setattr(script, "make_env", lambda *_: gym.make(args.env_id, max_episode_steps=step))
-    assert np.isnan(script.evaluate(agent, [0, 2])[0]).all()
-
-
-def test_absurd_learning_rate(script, tmp_path):
-    flags = ("--env-id", "Pendulum-v1", "--learning-rate", "1e30", "--run-dir", tmp_path / "run")
-    done = run(f"{script.__name__}.py", *QUICK, *KEEP_ALL, *flags)
-    assert done.returncode == 3
-    failure = read_failure(tmp_path / "run")
-    assert "loss" in failure["what"] and failure["global_step"] == 32
-    assert {"nan", "inf"} & {value for name, value in failure.items() if name.startswith("losses/")}
-    (line,) = done.stderr.splitlines()
-    assert failure["what"] in line and "32" in line
-    assert not {"last.pt", "best.pt"} & {path.name for path in (tmp_path / "run").iterdir()}
-
-
-def test_divergence_after_a_while_keeps_the_last_good_checkpoint(script, tmp_path):
-    # the entropy bonus adds 5 to log_std in each of the two minibatches of an iteration, until exp(log_std) overflows
-    flags = ("--env-id", "Pendulum-v1", "--learning-rate", 5, "--no-anneal-lr", "--ent-coef", 1000)
-    with pytest.raises(SystemExit) as stop:
-        call_main(script, *QUICK, *KEEP_ALL, *flags, "--total-timesteps", 3200, "--run-dir", tmp_path)
-    assert stop.value.code == 3
-    step = read_failure(tmp_path)["global_step"]
-    assert 64 <= step < 3200
-    check_checkpoints(tmp_path, step - 32)

@@ -7,19 +7,19 @@ import multiprocessing
 import os
 import pickle
 import random
-import re
 import resource
 import shlex
 import shutil
 import signal
+import subprocess
 import sys
 import time
 import zipfile
 
 import pytest
 import torch
-from conftest import run
-from resume_helpers import SCRIPTS, Run, differences, finish, flags, outcome, send
+from conftest import ROOT
+from resume_helpers import SCRIPTS, Run, differences, finish, flags, killed_after, outcome, refusal, send
 
 
 @pytest.fixture(params=SCRIPTS)
@@ -50,20 +50,18 @@ def global_step(path) -> int:
 
 # --- Signals ----------------------------------------------------------------------------------------------------------
 
-MOMENTS = {  # in which of the script's functions, before which of its lines; the step at which the run then stops
-    "start": (("open_run", 5), None),
-    "rollout": (("collect", 1500), 192),
-    "update": (("learn", 100), 192),
-    "evaluation": (("evaluate", 1000), 128),
-    "checkpoint": (("save_checkpoint", 2), 64),
-    "final evaluation": (("load_checkpoint", 3), 512),
+MOMENTS = {  # before which execution of which line, and the step at which the run then stops
+    "start": (("training = run.begin_or_resume()", 1), None),
+    "rollout": (("= envs.step(", 150), 192),
+    "update": (("update_function(agent.params", 20), 192),
+    "evaluation": (("lengths[i] += 1", 100), 128),
+    "checkpoint": (("torch.save(state, buffer)", 1), 64),
+    "final evaluation": (("lengths[i] += 1", 1700), 512),
 }
 CASES = [
-    *(("rollout", signum) for signum in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)),
+    *(("rollout", signum) for signum in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, signal.SIGHUP)),
     ("start", signal.SIGTERM),
     ("update", signal.SIGINT),
-    ("update", signal.SIGUSR1),
-    ("evaluation", signal.SIGINT),
     ("evaluation", signal.SIGTERM),
     ("checkpoint", signal.SIGUSR1),
     ("final evaluation", signal.SIGINT),
@@ -86,23 +84,29 @@ def test_signal_saves_and_stops(name, moment, signum, whole, tmp_path):
     assert differences(whole(name), outcome(tmp_path / "run")) == []
 
 
+@pytest.mark.slow
 def test_printed_command_continues(name, tmp_path):
-    """Without --run-dir it names the folder that the run has made for itself."""
+    """It can be pasted into a shell, and without --run-dir names the folder that the run has made for itself."""
+    folder = tmp_path / "it's mine"
+    folder.mkdir()
 
     def leave():
-        os.chdir(tmp_path)
+        os.chdir(folder)
 
-    stopped = Run(name, flags("x")[2:], tmp_path / "log", at=("prepare_batch", 3), action=send(15), before=leave)
+    words = [*flags("x")[2:], "--exp-name", "a b"]
+    stopped = Run(name, words, tmp_path / "log", at=("rollout = collect(", 3), action=send(15), before=leave)
     assert stopped.wait() == 75, stopped.output()
-    python, *command = shlex.split(stopped.output().splitlines()[-1])
-    (run_dir,) = (tmp_path / "runs").iterdir()
-    assert command[-3:] == ["--run-dir", f"runs/{run_dir.name}", "--resume"]
-    assert run(*command, cwd=tmp_path).returncode == 0
-    assert (run_dir / "result.json").exists()
+    (run_dir,) = (folder / "runs").iterdir()
+    *_, command = stopped.output().splitlines()
+    assert command.endswith(f" --run-dir 'runs/{run_dir.name}' --resume")
+    done = subprocess.run(command, shell=True, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0 and (run_dir / "result.json").exists(), done.stderr
 
 
 @pytest.mark.parametrize("signals", [(signal.SIGINT, signal.SIGINT), (signal.SIGTERM, signal.SIGINT)])
-@pytest.mark.parametrize("at", [("evaluate", 1000), ("write_atomically", 25), ("update", 150)], ids=lambda at: at[0])
+@pytest.mark.parametrize(
+    "at", [("lengths[i] += 1", 100), ("os.fsync(", 3), ("torch.func.grad(", 10)], ids=lambda at: at[0]
+)
 def test_second_interrupt_stops_at_once(name, at, signals, whole, tmp_path):
     words = flags(tmp_path / "run", "--resume")
     stopped = Run(name, words, tmp_path / "log", at=at, action=send(*signals))
@@ -111,6 +115,27 @@ def test_second_interrupt_stops_at_once(name, at, signals, whole, tmp_path):
     assert differences(whole(name), outcome(tmp_path / "run")) == []
 
 
+@pytest.mark.slow
+def test_a_reader_that_leaves_ends_no_training(name, tmp_path):
+    """As in `| head -1`, with standard error or without."""
+    for i, end in enumerate(("", "2>&1")):
+        words = shlex.join(map(str, flags(tmp_path / str(i), progress=True)))
+        command = f"{sys.executable} {name} {words} {end} | head -1"
+        shown = subprocess.run(command, shell=True, cwd=ROOT, capture_output=True, text=True)
+        assert "evaluation return" in shown.stdout and shown.stdout.count("\n") == 1 and shown.stderr == ""
+        assert (tmp_path / str(i) / "result.json").exists()
+
+
+def test_a_closed_terminal_under_nohup_stops_nothing(name, whole, tmp_path):
+    def nohup():
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+    at = "rollout = collect(", 3
+    finish(name, flags(tmp_path / "run"), tmp_path / "log", at=at, action=send(signal.SIGHUP), before=nohup)
+    assert differences(whole(name), outcome(tmp_path / "run")) == []
+
+
+@pytest.mark.slow
 def test_interrupt_while_compiling(name, tmp_path):
     """Ctrl-C reaches the C++ compiler as well, and its failure must not look like one of the machine."""
     cache = tmp_path / "cache"
@@ -141,14 +166,14 @@ def test_full_disk(name, what, whole, tmp_path):
     """One clear line, a failing exit code, and the checkpoint from before is whole and is continued from."""
     settings = {"actor_hidden": 64} if what == "checkpoint" else {"total_timesteps": 1536, "checkpoint_interval": 256}
     run_dir, words = tmp_path / "run", flags(tmp_path / "run", "--resume", **settings)
-    assert Run(name, words, tmp_path / "log", at=("check_rollout", 15)).wait() == -signal.SIGKILL
+    killed_after(2, name, words, tmp_path / "log")
     before = (run_dir / "last.pt").read_bytes()
     size = len(before) if what == "log" else len(before) - 1000
     full = Run(name, words, tmp_path / "log", before=limit_files(size))
     assert full.wait() == 1, full.output()
     assert full.output().splitlines()[-1] == f"{name}: error: File too large; every checkpoint saved before is intact"
     if what == "checkpoint":
-        assert (run_dir / "last.pt").read_bytes() == before
+        assert (run_dir / "last.pt").read_bytes() == before and not list(run_dir.glob("*.tmp"))
     finish(name, words, tmp_path / "log")
     assert differences(whole(name, **settings), outcome(run_dir)) == []
 
@@ -181,10 +206,10 @@ def test_killed_while_saving_in_a_loop(script, tmp_path):
 
 
 def test_leftovers_of_a_kill_are_cleaned_up(name, whole, tmp_path):
-    """Torn temporary files, a torn record at the event file's end, and a report of a failure that is over."""
+    """Temporary files, a torn record at the event file's end, and a report of a failure that is over."""
     run_dir, words = tmp_path / "run", flags(tmp_path / "run", "--resume")
-    assert Run(name, words, tmp_path / "log", at=("check_rollout", 9)).wait() == -signal.SIGKILL
-    for leftover in ("last.pt.tmp", "best.pt.tmp", "config.json.tmp", "result.json.tmp", "failure.json"):
+    killed_after(2, name, words, tmp_path / "log")
+    for leftover in ("last.pt.tmp", "result.json.tmp", "failure.json"):
         (run_dir / leftover).write_bytes(b"torn")
     (events,) = run_dir.glob("events*")
     with open(events, "ab") as file:
@@ -204,8 +229,7 @@ def stopped(tmp_path_factory):
     def get(name):
         if name not in runs:
             runs[name] = tmp_path_factory.mktemp("stopped") / "run"
-            at = "exit_if_stopped", 4
-            assert Run(name, flags(runs[name], "--resume"), runs[name].with_suffix(".log"), at=at).wait() == -9
+            killed_after(3, name, flags(runs[name], "--resume"), runs[name].with_suffix(".log"))
         return runs[name]
 
     return get
@@ -296,23 +320,21 @@ def test_malicious_checkpoint_runs_nothing(legacy, stopped, tmp_path):
     assert not mark.exists()
 
 
-@pytest.mark.parametrize("missing", ["global_step", "params", "normalizer"])
+@pytest.mark.parametrize("missing", ["args", "global_step", "params", "normalizer"])
 def test_incomplete_checkpoint_is_refused(name, missing, stopped, tmp_path):
     state = torch.load(stopped(name) / "best.pt")
     del state[missing]
     torch.save(state, tmp_path / "best.pt")
-    refused = Run(name, ["--evaluate", tmp_path / "best.pt"], tmp_path / "log")
-    assert refused.wait() == 2 and refused.output().count("\n") == 1, refused.output()
+    refusal(name, ["--evaluate", tmp_path / "best.pt"], tmp_path / "log")
 
 
-@pytest.mark.parametrize("missing", ["moments", "envs", "rng", "progress", "compiled"])
+@pytest.mark.parametrize("missing", ["adam", "envs", "rng", "progress", "compiled", "machine"])
 def test_checkpoint_without_a_part_cannot_be_resumed(name, missing, stopped, tmp_path):
     shutil.copytree(stopped(name), tmp_path / "run")
     state = torch.load(tmp_path / "run/last.pt")
     del state[missing]
     torch.save(state, tmp_path / "run/last.pt")
-    refused = Run(name, flags(tmp_path / "run", "--resume"), tmp_path / "log")
-    assert refused.wait() == 2 and refused.output().count("\n") == 1, refused.output()
+    assert "last.pt" in refusal(name, flags(tmp_path / "run", "--resume"), tmp_path / "log")
 
 
 def test_checkpoints_need_no_unsafe_global(name, stopped):
@@ -323,7 +345,7 @@ def test_checkpoints_need_no_unsafe_global(name, stopped):
 
 # --- Bad numbers and crashes ------------------------------------------------------------------------------------------
 
-FAULTY = {"env_id": "resume_helpers:Faulty-v0", "num_envs": 3, "num_steps": 20, "total_timesteps": 600}
+FAULTY = {"env_id": "odd_envs:Faulty-v0", "num_envs": 3, "num_steps": 20, "total_timesteps": 600}
 
 
 def fault(seed: int, step: int, way: str):
@@ -336,38 +358,47 @@ def fault(seed: int, step: int, way: str):
 
 
 def failure(run_dir) -> dict:
-    return json.loads((run_dir / "failure.json").read_text())
+    """failure.json, in strict JSON, of a run that is not complete."""
+    assert not (run_dir / "result.json").exists()
+    return json.loads((run_dir / "failure.json").read_text(), parse_constant=pytest.fail)
 
 
 @pytest.mark.parametrize(
     "way, step, normalize",
     [
         ("nan-reward", 23, True),
-        ("inf-reward", 23, False),
-        ("-inf-reward", 40, True),
+        ("-inf-reward", 40, False),
         ("nan-obs", 23, True),
-        ("nan-obs", 40, False),
-        ("inf-obs", 40, True),
-        ("inf-obs", 23, False),
+        ("inf-obs", 40, False),
+        ("nan-obs", 0, True),
+        ("inf-obs", 0, False),
     ],
 )
 def test_bad_number_in_a_rollout(script, way, step, normalize, whole, tmp_path):
-    """Environment 1's second episode is steps 41 to 80 of each environment, of which 61 to 80 are iteration 4."""
+    """Environment 1's second episode is its steps 41 to 80, and the first observation of it comes with step 40."""
     name, settings = f"{script.__name__}.py", FAULTY | {"normalize_obs": normalize, "normalize_reward": normalize}
     words = flags(tmp_path / "run", "--resume", **settings)
     (seed,) = script.episode_seeds(1, 0, 1, 1)
     failed = Run(name, words, tmp_path / "log", before=fault(seed, step, way))
     assert failed.wait() == 3, failed.output()
-    facts = failure(tmp_path / "run")
-    assert facts["what"] == "a reward or an observation"
-    assert (facts["global_step"], facts["env"]) == ((40 + step) * 3, 1)
-    number = way.rsplit("-", 1)[0]
-    assert number == facts["reward"] if way.endswith("reward") else number in facts["next_obs"]
+    facts, (number, what), begun = failure(tmp_path / "run"), way.rsplit("-", 1), 180 if step else 60
+    assert what[:3] in facts["what"] and number in facts["value"]
+    assert (facts["global_step"], facts["env"]) == (begun, 1)
+    assert (facts["episode_seed"], facts["episode_step"]) == (seed, step)
     line = failed.output().splitlines()[-1]
     assert line.startswith(f"{name}: numerical failure: ") and "'env': 1" in line and "Traceback" not in failed.output()
-    assert global_step(tmp_path / "run/last.pt") == 180
+    assert not step or global_step(tmp_path / "run/last.pt") == begun
     finish(name, words, tmp_path / "log")  # the fault is gone
     assert differences(whole(name, **settings), outcome(tmp_path / "run")) == []
+
+
+def test_infinite_first_observation_of_all(script, tmp_path):
+    (seed,) = script.episode_seeds(1, 0, 0, 0)
+    words = flags(tmp_path / "run", "--resume", **FAULTY)
+    failed = Run(f"{script.__name__}.py", words, tmp_path / "log", before=fault(seed, 0, "inf-obs"))
+    assert failed.wait() == 3, failed.output()
+    facts = failure(tmp_path / "run")
+    assert "observation" in facts["what"] and (facts["env"], facts["episode_step"], facts["global_step"]) == (0, 0, 0)
 
 
 def test_crashing_environment(script, whole, tmp_path):
@@ -382,23 +413,32 @@ def test_crashing_environment(script, whole, tmp_path):
     assert differences(whole(name, **FAULTY), outcome(tmp_path / "run")) == []
 
 
+def test_environment_that_crashes_in_the_replay(script, tmp_path):
+    """It keeps its traceback; the checkpoint is not called damaged."""
+    name, words = f"{script.__name__}.py", flags(tmp_path / "run", "--resume", **FAULTY)
+    killed_after(2, name, words, tmp_path / "log")
+    (seed,) = script.episode_seeds(1, 0, 1, 1)
+    crashed = Run(name, words, tmp_path / "log", before=fault(seed, 7, "crash"))
+    assert crashed.wait() == 1, crashed.output()
+    assert "RuntimeError: the simulator crashed" in crashed.output() and "damaged" not in crashed.output()
+
+
 @pytest.mark.parametrize("final", [False, True])
 def test_bad_number_in_an_evaluation(script, final, tmp_path):
     name, words = f"{script.__name__}.py", flags(tmp_path / "run", **FAULTY)
     args = script.Args(eval_episodes=2, final_eval_episodes=2)
     bad_step = 600 if final else 180
-    seed = script.evaluation_seeds(args, bad_step, final)[1]
+    seed = script.evaluation_seeds(args, bad_step, final=final)[1]
     failed = Run(name, words, tmp_path / "log", before=fault(seed, 7, "nan-reward"))
     assert failed.wait() == 3, failed.output()
     facts = failure(tmp_path / "run")
-    assert (facts["what"], facts["global_step"]) == ("an evaluation return", bad_step)
-    assert re.fullmatch(r"\[-?\d+\.\d+, nan\]", facts["returns"])
-    assert not (tmp_path / "run/result.json").exists()
+    assert (facts["what"], facts["global_step"], facts["evaluation_episode"]) == ("a reward", bad_step, 1)
+    assert (facts["episode_seed"], facts["episode_step"], facts["value"]) == (seed, 7, "nan")
 
 
 BAD_UPDATES = {
-    "losses/value_loss": {"env_id": "resume_helpers:Huge-v0", "normalize_reward": False},
-    "obs.squares": {"env_id": "resume_helpers:Faulty-v0"},
+    "losses/value_loss": {"env_id": "odd_envs:Huge-v0", "normalize_reward": False},
+    "obs.squares": {"env_id": "odd_envs:Faulty-v0"},
     "actor.0.weight": {"learning_rate": 1e38},
 }
 
@@ -411,15 +451,28 @@ def test_bad_number_in_an_update(script, culprit, tmp_path):
     failed = Run(name, words, tmp_path / "log", before=fault(seed, 3, "1e200-obs"))
     assert failed.wait() == 3, failed.output()
     facts = failure(tmp_path / "run")
-    assert facts["global_step"] == 64 and culprit in facts["not_finite"]
-    assert not (tmp_path / "run/last.pt").exists()
+    assert facts["global_step"] == 0 and culprit in facts["not_finite"]
+    assert not list((tmp_path / "run").glob("*.pt"))
+
+
+def test_divergence_after_a_while_keeps_the_last_good_checkpoint(name, tmp_path):
+    """The entropy bonus adds 5 to log_std in each of the minibatches, until exp(log_std) overflows."""
+    settings = {"learning_rate": 5, "anneal_lr": False, "ent_coef": 1000, "num_steps": 32, "num_minibatches": 2}
+    words = flags(tmp_path / "run", **settings, update_epochs=1, total_timesteps=3200, checkpoint_interval=1)
+    failed = Run(name, words, tmp_path / "log")
+    assert failed.wait() == 3, failed.output()
+    step = failure(tmp_path / "run")["global_step"]
+    assert 64 <= step < 3200
+    last = torch.load(tmp_path / "run/last.pt", weights_only=True)
+    assert last["global_step"] == step
+    assert all(x.isfinite().all() for x in (*last["params"].values(), *last["normalizer"].values()))
 
 
 def test_mujoco_warnings_are_counted(name, whole, tmp_path):
     """An unstable simulation resets itself silently; the chart tells, also after a resume."""
-    settings = {"env_id": "resume_helpers:Unstable-v0"}
+    settings = {"env_id": "odd_envs:Unstable-v0"}
     run_dir, words = tmp_path / "run", flags(tmp_path / "run", "--resume", **settings)
-    assert Run(name, words, tmp_path / "log", at=("check_rollout", 7)).wait() == -signal.SIGKILL
+    killed_after(2, name, words, tmp_path / "log")
     finish(name, words, tmp_path / "log")
     found = outcome(run_dir)
     assert differences(whole(name, **settings), found) == []

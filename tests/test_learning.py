@@ -1,16 +1,13 @@
 """Both scripts learn the probe environments, through their whole `main`, in seconds each."""
 
-import json
-import signal
-import sys
-
 import numpy as np
-import probe_envs
 import pytest
 import torch
+from test_commands import call_main, read_json
 
 import ppo_continuous
 import refineppo_continuous
+from sweeps.toy_env import phi, psi
 
 FLAGS = """--total-timesteps 6144 --num-steps 512 --num-minibatches 4 --update-epochs 8 --learning-rate 5e-3
            --actor-hidden 32 32 --critic-hidden 32 32 --log-std-init -1 --eval-episodes 1 --final-eval-episodes 100
@@ -18,34 +15,32 @@ FLAGS = """--total-timesteps 6144 --num-steps 512 --num-minibatches 4 --update-e
 
 
 @pytest.fixture
-def train(tmp_path, monkeypatch):
-    """Train as the command line would; the final policy's mean return over 100 episodes, and its checkpoint."""
+def train(tmp_path):
+    """Train as the command line would; the final policy's mean return over 100 episodes, and its agent."""
 
-    def train(script, env, *flags):
-        command = f"{script.__file__} --env-id probe_envs:{env}-v0 --run-dir {tmp_path / 'run'} {FLAGS}"
-        monkeypatch.setattr(sys, "argv", [*command.split(), *flags])
-        monkeypatch.setattr(signal, "signal", lambda *_: None)
-        script.main()
-        result = json.loads((tmp_path / "run" / "result.json").read_text())
-        return result["last"]["mean"], torch.load(tmp_path / "run" / "last.pt", weights_only=True)
+    def train(script, env_id, *flags):
+        call_main(script, "--env-id", env_id, "--run-dir", tmp_path, *FLAGS.split(), *flags)
+        return read_json(tmp_path / "result.json")["last"]["mean"], script.load_agent(tmp_path / "last.pt")
 
     return train
 
 
+@pytest.mark.slow
 def test_value_of_a_constant_reward(script, train):
-    _, checkpoint = train(script, "ConstantReward", "--no-normalize-reward")
+    _, agent = train(script, "probe_envs:ConstantReward-v0", "--no-normalize-reward")
     obs = torch.linspace(-1.5, 1.5, 31)[:, None]  # normalised: uniform, of standard deviation 1
-    values = script.critic_value(script.layers(checkpoint["params"], "critic"), obs)
-    torch.testing.assert_close(values, torch.ones(31), rtol=0, atol=0.05)
+    values = script.network(script.layers(agent.params, "critic"), obs)
+    torch.testing.assert_close(values, torch.ones(31, 1), rtol=0, atol=0.05)
 
 
-@pytest.mark.parametrize("env", ["MatchAction", "TwoStepCredit"])
+@pytest.mark.parametrize("env", [pytest.param("MatchAction", marks=pytest.mark.slow), "TwoStepCredit"])
 def test_right_action_for_the_observation(script, train, env):
     """The best action that ignores the observation s, or what it leads to, loses E[s^2] = 1/3."""
-    mean_return, _ = train(script, env)
+    mean_return, _ = train(script, f"probe_envs:{env}-v0")
     assert mean_return > -1 / 3 / 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "script, flags",
     [
@@ -56,10 +51,10 @@ def test_right_action_for_the_observation(script, train, env):
     ids=["ppo", "depth 4", "depth 2"],
 )
 def test_coordination(script, flags, train):
-    """Far better than the best linear policy, which must leave the second action uncoordinated with the first."""
+    """The paper's task: far better than the best linear policy, which leaves the second action uncoordinated."""
     s = np.linspace(-1, 1, 1001)
-    right = np.stack([probe_envs.phi(s), probe_envs.psi(s, probe_envs.phi(s))], axis=1)
+    right = np.stack([phi(s), psi(s, phi(s))], axis=1)
     inputs = np.stack([s, np.ones_like(s)], axis=1)
     linear = inputs @ np.linalg.lstsq(inputs, right)[0]
-    mean_return, _ = train(script, "Coordination", *flags)
+    mean_return, _ = train(script, "sweeps.toy_env:Coordination-v0", *flags)
     assert mean_return > -((right - linear) ** 2).sum(1).mean() / 10

@@ -14,7 +14,7 @@ from dataclasses import fields
 from pathlib import Path
 
 import pytest
-from conftest import ROOT, run
+from conftest import ROOT, python, run
 from test_commands import QUICK
 
 import analysis_refinement
@@ -46,10 +46,8 @@ def commands(block: str) -> list[list[str]]:
     return [words for words in (shlex.split(line, comments=True) for line in lines) if words]
 
 
-def python(*words, folder: Path) -> str:
-    paths = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
-    done = subprocess.run([sys.executable, *words], cwd=folder, env=os.environ | {"PYTHONPATH": paths},
-                          capture_output=True, text=True)  # fmt: skip
+def output(*words, folder: Path) -> str:
+    done = python(*words, cwd=folder)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -69,11 +67,11 @@ def run_command(words: list[str], folder: Path):
             known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
             assert set(extras.split(",")) - {""} <= set(known)
         case ["pytest"]:
-            found = python("-m", "pytest", "--collect-only", "-q", "-n", "0", "-p", "no:cacheprovider", folder=ROOT)
+            found = output("-m", "pytest", "--collect-only", "-q", "-n", "0", "-p", "no:cacheprovider", folder=ROOT)
             assert "tests/test_readme.py" in found
         case ["tensorboard", "--logdir", logdir]:
             assert (folder / logdir).is_dir()
-            shown = python("-m", "tensorboard.main", "--logdir", logdir, "--inspect", folder=folder)
+            shown = output("-m", "tensorboard.main", "--logdir", logdir, "--inspect", folder=folder)
             assert "charts/SPS" in shown and "eval/return_mean" in shown
         case ["python", name, "--evaluate", checkpoint, "--render"] if name in SCRIPTS:
             # MuJoCo's windows need a display; LunarLander's opens without one
@@ -85,9 +83,10 @@ def run_command(words: list[str], folder: Path):
             cut = words.index("|")
             chosen = dict(word.split("=") for word in words[:cut] if "=" in word)
             generator, (executor, *flags) = words[len(chosen) : cut], words[cut + 1 :]
-            jobs = subprocess.run(generator, cwd=ROOT, env=os.environ | chosen, capture_output=True, text=True)
-            planned = subprocess.run([executor, "--dry-run", *flags], cwd=ROOT, input=jobs.stdout,
-                                     capture_output=True, text=True)  # fmt: skip
+            path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])  # as in its environment
+            chosen, dry = os.environ | {"PATH": path} | chosen, [executor, "--dry-run", *flags]
+            jobs = subprocess.run(generator, cwd=ROOT, env=chosen, capture_output=True, text=True)
+            planned = subprocess.run(dry, cwd=ROOT, input=jobs.stdout, capture_output=True, text=True)
             assert (jobs.returncode, planned.returncode) == (0, 0), jobs.stderr + planned.stderr
             assert jobs.stdout.count("_continuous.py --env-id") == planned.stdout.count("_continuous.py --env-id") > 0
         case ["python", "sweeps/tune.py", *flags]:
@@ -110,11 +109,12 @@ def run_command(words: list[str], folder: Path):
             pytest.fail(f"no test runs the README's command: {shlex.join(words)}")
 
 
+@pytest.mark.slow
 def test_every_command_and_snippet(tmp_path):
     ran = []
     for language, content in blocks(readme()):
         if language == "python":
-            assert python("-c", content, folder=tmp_path).strip()
+            assert output("-c", content, folder=tmp_path).strip()
             ran.append("snippet")
         for words in commands(content) if language in ("bash", "sh", "console") else []:
             run_command(words, tmp_path)

@@ -75,77 +75,61 @@ def folders(lines: list[str]) -> list[str]:
     return [Path(parse(line).run_dir).name for line in lines]
 
 
-def method(args) -> tuple:
-    """(script, K, schedule, the actor's layers)."""
-    refinement = getattr(args, "refinement_depth", None), getattr(args, "refinement_schedule", None)
-    return args.exp_name.removesuffix("_continuous"), *refinement, args.actor_hidden
+def method(args) -> str:
+    """K4-average of RefinePPO, ppo-128x128 of PPO."""
+    if args.exp_name == "refineppo_continuous":
+        assert args.actor_hidden == (128, 128)
+        return f"K{args.refinement_depth}-{args.refinement_schedule}"
+    return f"ppo-{'x'.join(map(str, args.actor_hidden))}"
 
 
 # --- Generators -------------------------------------------------------------------------------------------------------
 
+CONTROLS = "HalfCheetah-v5 Pusher-v5 Hopper-v5 HumanoidStandup-v5 Swimmer-v5".split()
+SWEEPS = {
+    "benchmark.sh": (6_000_000, TASKS, "ppo-128x128 K4-average"),
+    "depth.sh": (6_000_000, TASKS, "K1-average K2-average K4-average K8-average"),
+    "schedule.sh": (6_000_000, MUJOCO, "K4-average K4-uniform K4-inverse"),
+    "toy.sh": (
+        50_000,
+        ["sweeps.toy_env:Coordination-v0"],
+        "ppo-128x128 K1-average K1-uniform K2-average K2-uniform K4-average K4-uniform",
+    ),
+    "controls.sh": (
+        1_000_000,
+        CONTROLS,
+        "K1-average K2-average K8-average K4-uniform K4-inverse ppo-128x128x128x128x128 ppo-256x256",
+    ),
+}
 
-def ppo(*layers) -> tuple:
-    return "ppo", None, None, layers or (128, 128)
 
-
-def refined(depth: int, schedule: str) -> tuple:
-    return "refineppo", depth, schedule, (128, 128)
-
-
-@pytest.mark.parametrize(
-    "script, tasks, methods, seeds, steps",
-    [
-        ("benchmark.sh", TASKS, {ppo(), refined(4, "average")}, 5, 6_000_000),
-        ("depth.sh", TASKS, {refined(k, "average") for k in (1, 2, 4, 8)}, 5, 6_000_000),
-        ("schedule.sh", MUJOCO, {refined(4, s) for s in ("average", "uniform", "inverse")}, 5, 6_000_000),
-        (
-            "toy.sh",
-            ["sweeps.toy_env:Coordination-v0"],
-            {ppo()} | {refined(k, s) for k in (1, 2, 4) for s in ("uniform", "average")},
-            5,
-            50_000,
-        ),
-        (
-            "controls.sh",
-            ["HalfCheetah-v5", "Pusher-v5", "Hopper-v5", "Swimmer-v5"],  # and HumanoidStandup, see below
-            {refined(k, "average") for k in (1, 2, 8)}
-            | {refined(4, s) for s in ("uniform", "inverse")}
-            | {ppo(128, 128, 128, 128, 128), ppo(256, 256)},
-            5,
-            1_000_000,
-        ),
-    ],
-)
-def test_a_sweep_is_complete(script, tasks, methods, seeds, steps):
+@pytest.mark.parametrize("script", SWEEPS)
+def test_a_sweep_is_complete(script):
+    steps, tasks, methods = SWEEPS[script]
     args = [parse(line) for line in generate(script)]
-    assert len({a.run_dir for a in args}) == len(args)
-    assert all(a.resume and a.total_timesteps == steps for a in args)
     assert [a.seed for a in args] == sorted(a.seed for a in args)  # all tasks of seed 1 first
-    runs = {(a.env_id, a.seed, method(a)) for a in args if script != "controls.sh" or a.env_id in tasks}
-    assert runs == {(task, seed, m) for task in tasks for seed in range(1, seeds + 1) for m in methods}
-    rest = {(a.env_id, a.seed, method(a)) for a in args} - runs
-    wide = {ppo(216, 216) if m == ppo(256, 256) else m for m in methods}
-    assert not rest or rest == {("HumanoidStandup-v5", seed, m) for seed in range(1, 6) for m in wide}
-    assert len(args) == (175 if script == "controls.sh" else len(runs))
+    assert all(a.resume and a.total_timesteps == steps for a in args)
+    runs = [(a.env_id, a.seed, method(a)) for a in args]
+    wide = [m.replace("ppo-216x216", "ppo-256x256") if task == "HumanoidStandup-v5" else m for task, _, m in runs]
+    assert ("HumanoidStandup-v5", 1, "ppo-256x256") not in runs
+    found = {(task, seed, m) for (task, seed, _), m in zip(runs, wide)}
+    assert found == {(task, seed, m) for task in tasks for seed in range(1, 6) for m in methods.split()}
+    assert len(found) == len(args) == len({a.run_dir for a in args})
 
 
 def test_learning_rates_are_a_third_and_three_times_the_tasks(tmp_path):
     (tmp_path / "tuned" / "ppo").mkdir(parents=True)
     (tmp_path / "tuned" / "ppo" / "Swimmer-v5.args").write_text("--learning-rate 6e-4")
     args = [parse(line) for line in generate("learning_rates.sh", folder=tmp_path, SETTINGS="tuned")]
+    expected = {}
+    for task in ("HalfCheetah-v5", "Hopper-v5", "Swimmer-v5"):
+        expected |= {(task, m): {1e-4, 9e-4} for m in ("ppo-128x128", "K4-average", "K4-uniform")}
+    expected["Swimmer-v5", "ppo-128x128"] = {2e-4, 1.8e-3}
     runs = {(a.env_id, a.seed, method(a), a.learning_rate) for a in args}
-    tasks, methods = (
-        ("HalfCheetah-v5", "Hopper-v5", "Swimmer-v5"),
-        (ppo(), refined(4, "average"), refined(4, "uniform")),
-    )
-    assert len(args) == 54 and {a.total_timesteps for a in args} == {1_000_000}
     assert runs == {
-        (task, seed, m, rate)
-        for task in tasks
-        for m in methods
-        for seed in (1, 2, 3)
-        for rate in ((2e-4, 1.8e-3) if (task, m) == ("Swimmer-v5", ppo()) else (1e-4, 9e-4))
+        (task, seed, m, rate) for (task, m), rates in expected.items() for seed in (1, 2, 3) for rate in rates
     }
+    assert len(args) == 54 and {a.total_timesteps for a in args} == {1_000_000}
 
 
 def test_a_run_has_one_command_in_all_sweeps():
@@ -156,40 +140,34 @@ def test_a_run_has_one_command_in_all_sweeps():
     assert shared == {(task, seed) for task in MUJOCO for seed in range(1, 6)}
 
 
-def test_a_folder_says_what_distinguishes_a_run():
-    chosen = {"SEEDS": "1", "SETTINGS": "none"}
-    assert folders(generate("benchmark.sh", "HalfCheetah-v5", **chosen)) == [
-        "HalfCheetah-v5__ppo__6M__1",
-        "HalfCheetah-v5__refineppo-K4-average__6M__1",
-    ]
-    names = {
-        "--actor-hidden 256 256": "256x256__50k",
-        "--actor-hidden=128 128 --gamma=0.99": "50k",  # as the scripts have it
-        "--learning_rate 0.001 --no-anneal-lr": "no-anneal-lr,learning-rate=0.001__50k",
-        "--no-anneal-lr --learning-rate 1e-3": "no-anneal-lr,learning-rate=0.001__50k",
-        "--save-every 5000 --checkpoint-interval 9 --no-progress --track --capture-video": "50k",
-        "--eval-interval 5000 --actor-hidden 8 --critic-hidden 8 8": "8__critic-hidden=8x8,eval-interval=5000__50k",
-    }
-    for flags, name in names.items():
-        (line,) = generate("benchmark.sh", "Maze:Hard/A-v1", STEPS="50000", FLAGS=flags, **chosen)[:1]
-        assert folders([line]) == [f"Maze_Hard_A-v1__ppo__{name}__1"]
-        given = tyro.cli(ppo_continuous.Args, args=shlex.split(flags))
-        parsed = parse(line)
-        others = ("env_id", "seed", "total_timesteps", "run_dir", "resume")
-        assert all(getattr(parsed, name) == value for name, value in vars(given).items() if name not in others)
-    many = "--gamma 0.9 --gae-lambda 0.8 --clip-coef 0.1 --ent-coef 0.125 --vf-coef 0.625 --max-grad-norm 0.875"
-    many += " --num-envs 2 --num-steps 1024 --num-minibatches 16 --update-epochs 5"
-    long = [folders(generate("benchmark.sh", "Hopper-v5", STEPS="4097", FLAGS=f"{many} --log-std-init {x}", **chosen))
-            for x in (-1, -2)]  # fmt: skip
-    assert all(re.fullmatch(r"Hopper-v5__ppo__11-flags-[0-9a-f]{8}__4097__1", name) for name, _ in long)
-    assert len({name for names in long for name in names}) == 4
+@pytest.mark.parametrize(
+    "flags, name",
+    [
+        ("", "Maze_Hard_A-v1__ppo__50k__1"),
+        ("--actor-hidden 256 256", "Maze_Hard_A-v1__ppo__256x256__50k__1"),
+        ("--actor-hidden=128 128 --gamma=0.99 --save-every 5000 --no-progress", "Maze_Hard_A-v1__ppo__50k__1"),
+        ("--learning_rate .001 --no-anneal-lr", "Maze_Hard_A-v1__ppo__no-anneal-lr,learning-rate=0.001__50k__1"),
+        ("--no-anneal-lr --learning-rate 1e-3", "Maze_Hard_A-v1__ppo__no-anneal-lr,learning-rate=0.001__50k__1"),
+        ("--critic-hidden 8 8 --actor-hidden 8", "Maze_Hard_A-v1__ppo__8__critic-hidden=8x8__50k__1"),
+        (f"{TINY} --gamma 0.9 --gae-lambda 0.8", r"Maze_Hard_A-v1__ppo__16__10-flags-[0-9a-f]{8}__50k__1"),
+    ],
+)
+def test_a_folder_says_what_distinguishes_a_run(flags, name):
+    chosen = {"SEEDS": "1", "SETTINGS": "none", "STEPS": "50000"}
+    ppo, refineppo = generate("benchmark.sh", "Maze:Hard/A-v1", FLAGS=flags, **chosen)
+    assert re.fullmatch(name, *folders([ppo]))
+    assert re.fullmatch(name.replace("ppo", "refineppo-K4-average"), *folders([refineppo]))
+    given, own = (
+        tyro.cli(ppo_continuous.Args, args=shlex.split(flags)),
+        {"env_id", "total_timesteps", "run_dir", "resume"},
+    )
+    assert {k: v for k, v in vars(given).items() if k not in own}.items() <= vars(parse(ppo)).items()
 
 
 def test_tasks_seeds_steps_and_folders_can_be_chosen(tmp_path):
     chosen = {"SEEDS": "7 11", "STEPS": "4096", "HOME": str(tmp_path)}
-    args = [
-        parse(line) for line in generate("benchmark.sh", "Hopper-v5", "Pendulum-v1", RUNS_DIR="~/my runs", **chosen)
-    ]
+    lines = generate("benchmark.sh", "Hopper-v5", "Pendulum-v1", RUNS_DIR="~/my runs", **chosen)
+    args = [parse(line) for line in lines]
     assert [(a.seed, a.env_id) for a in args[::2]] == [(s, t) for s in (7, 11) for t in ("Hopper-v5", "Pendulum-v1")]
     assert {a.total_timesteps for a in args} == {4096}
     assert {Path(a.run_dir).parent for a in args} == {tmp_path / "my runs"}
@@ -236,13 +214,12 @@ def test_settings_files(tmp_path):
 
 @pytest.mark.parametrize(
     "text, names",
-    [
-        ("--gamma 0.9 --no-such-flag 2", "--no-such-flag"),
-        ("--refinement-schedule uniform\n--refinement-depth # 2", "--refinement-depth"),
-        ("--seed 1", "--seed is the sweep's own"),
-        ("--total-timesteps 6000000", "--total-timesteps is the sweep's own"),
-        ("--gamma 'x", "quotation"),
-    ],
+    {
+        "--gamma 0.9 --no-such-flag 2": "--no-such-flag",
+        "--refinement-schedule uniform\n--refinement-depth # 2": "--refinement-depth",
+        "--seed 1": "--seed is the sweep's own",
+        "--gamma 'x": "quotation",
+    }.items(),
 )
 def test_settings_that_would_mislead_are_refused(text, names, tmp_path):
     (tmp_path / "tuned" / "refineppo").mkdir(parents=True)
@@ -252,32 +229,27 @@ def test_settings_that_would_mislead_are_refused(text, names, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "script, words, settings, names",
+    "words, names, settings",
     [
-        *(
-            (script, words, settings, names)
-            for script in ("depth.sh", "toy.sh")
-            for words, settings, names in (
-                (["--depth"], {}, "--depth"),
-                ([], {"SEEDS": "1 two"}, "SEEDS"),
-                ([], {"SEEDS": "1,2"}, "SEEDS"),
-                ([], {"SEEDS": " "}, "SEEDS"),
-                ([], {"SEEDS": "1 01"}, "SEEDS"),
-                ([], {"STEPS": "6e6"}, "STEPS"),
-                ([], {"SETTINGS": "no/such"}, "no/such"),
-                ([], {"DONE": "no/such.csv"}, "no/such.csv"),
-                ([], {"DONE": str(ROOT / "sweeps" / "bounds.csv")}, "no column `run`"),
-            )
-        ),
-        ("depth.sh", ["a task"], {}, "a task"),
-        ("toy.sh", ["Hopper-v5"], {}, "one task"),
-        ("depth.sh", [], {"FLAGS": "--no-such-flag"}, "FLAGS: Unrecognized options: --no-such-flag"),
-        ("depth.sh", [], {"FLAGS": "--refinement-depth 2"}, "FLAGS: --refinement-depth is the sweep's own"),
-        ("benchmark.sh", [], {"FLAGS": "--run-dir x"}, "FLAGS: --run-dir is the sweep's own"),
+        (["--depth"], "--depth", {}),
+        (["a task"], "a task", {}),
+        ([], "SEEDS", {"SEEDS": "1 two"}),
+        ([], "SEEDS", {"SEEDS": "1,2"}),
+        ([], "SEEDS", {"SEEDS": " "}),
+        ([], "SEEDS", {"SEEDS": "1 01"}),
+        ([], "STEPS", {"STEPS": "6e6"}),
+        ([], "no/such", {"SETTINGS": "no/such"}),
+        ([], "no/such.csv", {"DONE": "no/such.csv"}),
+        ([], "no column `run`", {"DONE": str(ROOT / "pyproject.toml")}),
+        ([], "FLAGS: Unrecognized options: --no-such-flag", {"FLAGS": "--no-such-flag"}),
+        ([], "FLAGS: --refinement-depth is the sweep's own", {"FLAGS": "--refinement-depth 2"}),
+        ([], "FLAGS: --run-dir is the sweep's own", {"FLAGS": "--run-dir x"}),
     ],
 )
-def test_generators_refuse_in_one_sentence(script, words, settings, names, tmp_path):
-    check_refused(shell(tmp_path, script, *words, **settings), names, f"{script}: error: ")
+def test_generators_refuse_in_one_sentence(words, settings, names, tmp_path):
+    check_refused(shell(tmp_path, "depth.sh", *words, **settings), names, "depth.sh: error: ")
+    if words:
+        check_refused(shell(tmp_path, "toy.sh", "Hopper-v5"), "one task")
 
 
 @pytest.mark.parametrize("script", [*GENERATORS, "run_local.sh", "run_slurm.sh"])
@@ -420,24 +392,24 @@ def test_dry_run_runs_nothing(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "script, words, stdin, names",
+    "command, stdin, names",
     [
-        ("run_local.sh", ["-j", "0"], "true", "-j"),
-        ("run_local.sh", ["-j", "many"], "true", "-j"),
-        ("run_local.sh", ["-j"], "true", "-j"),
-        ("run_local.sh", ["--dryrun"], "true", "--dryrun"),
-        ("run_local.sh", ["no_such_file"], "", "no_such_file"),
-        ("run_local.sh", [], "# nothing\n\n", "no jobs"),
-        ("run_slurm.sh", ["--dry-run", "--max-running", "none"], "true", "--max-running"),
-        ("run_slurm.sh", ["--dry-run", "--max-running"], "true", "--max-running"),
-        ("run_slurm.sh", ["--dry-run", "--steps-per-task", "x"], "true", "--steps-per-task"),
-        ("run_slurm.sh", ["--dry-run", "--time=1:00"], "true", "--time"),
-        ("run_slurm.sh", ["--dry-run", "no_such_file"], "", "no_such_file"),
-        ("run_slurm.sh", ["--dry-run"], "", "no jobs"),
+        ("run_local.sh -j 0", "true", "-j"),
+        ("run_local.sh -j many", "true", "-j"),
+        ("run_local.sh -j", "true", "-j"),
+        ("run_local.sh --dryrun", "true", "--dryrun"),
+        ("run_local.sh no_such_file", "", "no_such_file"),
+        ("run_local.sh", "# nothing\n\n", "no jobs"),
+        ("run_slurm.sh --dry-run --max-running none", "true", "--max-running"),
+        ("run_slurm.sh --dry-run --max-running", "true", "--max-running"),
+        ("run_slurm.sh --dry-run --steps-per-task x", "true", "--steps-per-task"),
+        ("run_slurm.sh --dry-run --time=1:00", "true", "--time"),
+        ("run_slurm.sh --dry-run no_such_file", "", "no_such_file"),
+        ("run_slurm.sh --dry-run", "", "no jobs"),
     ],
 )
-def test_executors_refuse_in_one_sentence(script, words, stdin, names, tmp_path):
-    check_refused(shell(tmp_path, script, *words, stdin=stdin), names)
+def test_executors_refuse_in_one_sentence(command, stdin, names, tmp_path):
+    check_refused(shell(tmp_path, *command.split(), stdin=stdin), names)
     assert not any(tmp_path.iterdir())
 
 
