@@ -18,6 +18,7 @@ import gc
 import io
 import json
 import math
+import multiprocessing
 import os
 import platform
 import random
@@ -31,6 +32,8 @@ import time
 import traceback
 import warnings
 import zipfile
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, suppress
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -41,7 +44,6 @@ from typing import NamedTuple
 
 import filelock
 import gymnasium as gym
-import mujoco
 import numpy as np
 import torch
 import tyro
@@ -665,12 +667,16 @@ def evaluate(agent: Agent, seeds: list[int], render_mode: str | None = None, vid
 
     The normalizer is frozen, and no random stream of the training is touched. A signal ends it with what there is.
     """
+    if render_mode and len(seeds) > 1:  # one after the other: a window each, or all frames of an episode in memory
+        episodes = [evaluate(agent, [seed], render_mode, videos) for seed in seeds]
+        return tuple(np.concatenate(each) for each in zip(*episodes))
     returns, lengths = np.zeros(len(seeds)), np.zeros(len(seeds), int)
     seed_global_rng(seeds[0])
     envs = [make_env(agent.args, render_mode, evaluation_episode=i) for i in range(len(seeds))]
     if videos:
         recorded = {"video_folder": str(videos), "episode_trigger": lambda _: True, "disable_logger": True}
-        envs = [gym.wrappers.RecordVideo(env, name_prefix=f"seed-{seed}", **recorded) for env, seed in zip(envs, seeds)]
+        with warnings.catch_warnings(action="ignore"):  # that the folder is there already
+            envs = [gym.wrappers.RecordVideo(env, name_prefix=f"seed-{seeds[0]}", **recorded) for env in envs]
     obs = {i: env.reset(seed=seed)[0] for i, (env, seed) in enumerate(zip(envs, seeds))}  # of episodes that go on
     while obs and not stop_signals:
         for i, action in zip(list(obs), agent.act(np.stack(list(obs.values())))):
@@ -707,10 +713,9 @@ def evaluate_checkpoint(given: Args):
         refuse(f"{videos} exists already; move it away to record again")
     render_mode = "human" if args.render else "rgb_array" if videos else None
     agent, seeds = agent_of(checkpoint, args), evaluation_seeds(args, checkpoint["global_step"], final=True)
-    together = [[seed] for seed in seeds] if args.render else [seeds]  # one window after the other
-    returns, lengths = np.hstack([evaluate(agent, some, render_mode, videos) for some in together])  # (2, episodes)
+    returns, lengths = evaluate(agent, seeds, render_mode, videos)
     for i, (episode_return, length) in enumerate(zip(returns, lengths), start=1):
-        say(f"episode {i}: return {episode_return:.3f}, length {length:.0f}")
+        say(f"episode {i}: return {episode_return:.3f}, length {length}")
     mean, std = mean_and_std(returns)
     say(f"step {checkpoint['global_step']:,}: mean return {mean:.3f}, std {std:.3f} (ddof 1)")
     if videos:
@@ -720,7 +725,6 @@ def evaluate_checkpoint(given: Args):
 # The boundary between a task and everything else
 
 mujoco_warnings: list[str] = []  # where MuJoCo reports an unstable simulation, which it otherwise hides
-mujoco.set_mju_user_warning(mujoco_warnings.append)
 open_tasks: list["Task"] = []
 
 
@@ -797,6 +801,7 @@ def make_env(args: Args, render_mode: str | None = None, **facts) -> Task:
 
     `facts` are told where a number is not finite. What MuJoCo says of the model file while it loads is dropped.
     """
+    load_mujoco()
     seen, options = len(mujoco_warnings), {"max_episode_steps": args.max_episode_steps, "disable_env_checker": True}
     if render_mode:  # a task need not know the keyword
         options["render_mode"] = render_mode
@@ -805,6 +810,16 @@ def make_env(args: Args, render_mode: str | None = None, **facts) -> Task:
     if not isinstance(env.observation_space, gym.spaces.Box) or len(env.observation_space.shape) != 1:
         env = gym.wrappers.FlattenObservation(env)
     return Task(env, facts)
+
+
+def load_mujoco():
+    """Hear MuJoCo's warnings. It loads OpenGL at once, of the kind that MUJOCO_GL names, which may be missing."""
+    try:
+        import mujoco
+    except Exception as error:  # an ImportError, an AttributeError, a RuntimeError: each kind fails in its own way
+        sentence = f"MuJoCo does not start with MUJOCO_GL={os.environ.get('MUJOCO_GL')} on this machine"
+        refuse(f"{sentence}: {first_line(error)}; training needs none, {HOW_TO_DRAW}")
+    mujoco.set_mju_user_warning(mujoco_warnings.append)
 
 
 def episode_seeds(seed: int, *key: int, count: int = 1) -> list[int]:
@@ -828,6 +843,7 @@ def seed_global_rng(seed: int):
 # Arguments
 
 SCRIPT = Path(__file__).name
+HOW_TO_DRAW = "a window needs a screen, videos MUJOCO_GL=egl, or MUJOCO_GL=osmesa and the package libosmesa6"
 EXIT_BAD_ARGUMENTS, EXIT_FAILURE, EXIT_STOPPED = 2, 3, 75
 POSITIVE, FRACTION = ("positive", lambda x: 0 < x < math.inf), ("between 0 and 1", lambda x: 0 <= x <= 1)
 RULES = {"seed": ("from 0 to 2^63 - 1", lambda x: 0 <= x < 2**63), "gamma": FRACTION, "gae_lambda": FRACTION}
@@ -854,8 +870,22 @@ def first_line(error: BaseException) -> str:
     return next(iter(str(error).strip().splitlines()), type(error).__name__)
 
 
+def draw_once(args: Args):
+    """Show or record an episode of one step, by a policy that has learned nothing; refuse what cannot be drawn."""
+    args, folder = replace(args, max_episode_steps=1), tempfile.TemporaryDirectory()
+    with refusing(f"cannot draw {args.env_id}", HOW_TO_DRAW), folder, warnings.catch_warnings(action="ignore"):
+        task = make_env(args)
+        agent = Agent(task.observation_space, task.action_space, args)
+        if args.render:
+            evaluate(agent, [0], "human")
+        else:
+            evaluate(agent, [0], "rgb_array", Path(folder.name))
+            if not any(Path(folder.name).iterdir()):
+                raise ValueError("it gives no pictures as rgb_array")
+
+
 @contextmanager
-def refusing(sentence: str):
+def refusing(sentence: str, advice: str = ""):
     """What fails in the block is refused; an error that arose in the task's own code keeps its traceback."""
     try:
         yield
@@ -865,7 +895,7 @@ def refusing(sentence: str):
         innermost = Path(traceback.extract_tb(error.__traceback__)[-1].filename)
         if Path(gym.__file__).parent not in innermost.parents and innermost != Path(__file__):
             traceback.print_exception(error)
-        refuse(f"{sentence}: {first_line(error)}")
+        refuse(f"{sentence}: {first_line(error)}{advice and f'; {advice}'}")
 
 
 def check_args(args: Args):
@@ -893,6 +923,8 @@ def check_args(args: Args):
     ):
         if wanted and find_spec(module) is None:
             refuse(f"the package {module} is missing: pip install -e '.[{extra}]'")
+    if args.track and not args.evaluate:
+        check_wandb()
     if args.cuda and not torch.cuda.is_available():
         refuse("--cuda was asked for, but torch finds no CUDA device")
     check_task(args)
@@ -900,11 +932,24 @@ def check_args(args: Args):
     threadpool_limits(args.num_threads)
 
 
+def check_wandb():
+    """Refuse to go online without a key; it is looked for where W&B's own programs look."""
+    import wandb  # an optional extra
+
+    try:
+        online = wandb.setup().settings.mode == "online"
+        problem = online and not wandb.login(prompt=False, verify=False) and "it has no key on this machine"
+    except wandb.errors.Error as error:
+        problem = first_line(error)
+    if problem:
+        refuse(f"--track cannot log in to Weights & Biases: {problem}; use `wandb login`, or WANDB_MODE=offline")
+
+
 def check_task(args: Args):
     """Refuse a task that breaks the rules of gymnasium's Env, or cannot be drawn; warn of what else is doubtful."""
-    task_id, render_mode = args.env_id, "human" if args.render else "rgb_array" if args.capture_video else None
+    task_id = args.env_id
     with refusing(f"cannot make the task {task_id}"), warnings.catch_warnings(action="ignore"):
-        task = make_env(args, render_mode)  # its warnings are shown again when training makes its environments
+        task = make_env(args)  # its warnings are shown again when training makes its environments
     actions, problems = task.action_space, []
     if not (isinstance(actions, gym.spaces.Box) and len(actions.shape) == 1 and actions.dtype.kind == "f"):
         refuse(f"{task_id} has actions in {actions}; only a one-dimensional Box of real numbers is supported")
@@ -921,14 +966,16 @@ def check_task(args: Args):
     with refusing(f"{task_id} does not work as gymnasium's Env should"), suppress(NotFinite):  # training says where
         task.reset(seed=args.seed % 2**31)
         task.step(actions.sample())
-    if render_mode:
-        with refusing(f"cannot draw {task_id} (MUJOCO_GL=egl or MUJOCO_GL=osmesa draws without a screen)"):
-            if task.render() is None and render_mode == "rgb_array":
-                raise ValueError("it gives no pictures as rgb_array")
     others = f"training keeps {args.num_envs}, and an evaluation makes {args.eval_episodes} more"
     with refusing(f"cannot make {task_id} a second time beside the first ({others})"):
         make_env(args).close()
     task.close()
+    if args.render or args.capture_video:
+        try:  # in a process of its own, since a missing window or driver may end it in the middle
+            with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+                pool.submit(draw_once, args).result()
+        except BrokenProcessPool:
+            refuse(f"cannot draw {task_id}: it ended the process that tried to; {HOW_TO_DRAW}")
     std = math.exp(args.log_std_init)
     bounds = zip((actions.low / std).tolist(), (actions.high / std).tolist())
     if min(math.erf(high / 2**0.5) - math.erf(low / 2**0.5) for low, high in bounds) < 0.02:  # of 2
@@ -1084,7 +1131,7 @@ class Run:
         self.machine, self.start, self.compiled = describe_machine(), time.time(), False
         self.last_return = self.last_evaluation = "-"  # shown by the progress bar
         self.stack = ExitStack()  # what is to be closed, however the run ends
-        self.progress = Progress()
+        self.progress, self.wandb_run = Progress(), None
         try:
             str(self.dir).encode()
             self.dir.mkdir(parents=True, exist_ok=True)
@@ -1150,6 +1197,7 @@ class Run:
     def __exit__(self, kind, error, trace):
         """Close everything; where a number was not finite, say which, where and when, and leave what was saved."""
         self.stack.close()
+        self.tell_wandb("finish", 0 if error is None else 1)
         if isinstance(error, NotFinite):
             facts = error.facts | {"global_step": self.progress.global_step, "mujoco_warnings": mujoco_warnings[:5]}
             write_atomically(self.dir / "failure.json", json.dumps(facts, indent=2).encode())
@@ -1177,19 +1225,34 @@ class Run:
         return training
 
     def track(self):
-        """Weights & Biases shows what TensorBoard is given; a resumed run goes on in the same place."""
+        """Begin a run in Weights & Biases, or go on with the checkpoint's; offline where there is no network."""
         import wandb  # an optional extra
 
-        self.progress.wandb_id = self.progress.wandb_id or wandb.util.generate_id()
-        wandb.init(
-            project=self.args.wandb_project_name,
-            entity=self.args.wandb_entity,
-            id=self.progress.wandb_id,
-            name=self.dir.name,
-            resume="allow",
-            config=asdict(self.args),
-            sync_tensorboard=True,
-        )
+        names = {"project": self.args.wandb_project_name, "entity": self.args.wandb_entity, "name": self.dir.name}
+        names |= {"id": self.progress.wandb_id, "resume": "allow", "config": asdict(self.args)}
+        settings = wandb.Settings(init_timeout=30, finish_timeout=10)  # seconds; what is not sent stays on the disk
+        try:
+            self.wandb_run = wandb.init(**names, settings=settings)
+        except wandb.errors.Error as error:
+            say(f"warning: W&B goes on offline, for `wandb sync` to send it later: {first_line(error)}")
+            self.wandb_run = wandb.init(**names, settings=settings, mode="offline")
+        self.progress.wandb_id = self.wandb_run.id
+        self.wandb_run.define_metric("*", step_metric="global_step")
+
+    def tell_wandb(self, method: str, value):
+        """Call a method of W&B's run, if there is one; when that fails, the training goes on without it."""
+        try:
+            if self.wandb_run:
+                getattr(self.wandb_run, method)(value)
+        except Exception as error:  # its own process has died, a disk is full, ...
+            say(f"warning: W&B failed, and is told nothing more: {first_line(error)}")
+            self.wandb_run = None
+
+    def log_scalars(self, scalars: dict[str, float], step: int):
+        """To TensorBoard and to W&B, where each call is a row of its own: episodes may end at the same step."""
+        for name, value in scalars.items():
+            self.writer.add_scalar(name, value, step)
+        self.tell_wandb("log", scalars | {"global_step": step})
 
     def log_hyperparameters(self):
         """The flags, as text and in the HParams tab, and which charts stand together under Custom Scalars."""
@@ -1217,13 +1280,12 @@ class Run:
         """An iteration's numbers, and its episodes' (step, return, length)."""
         step = self.progress.global_step
         for episode_step, episode_return, length in episodes:
-            self.writer.add_scalar("charts/episodic_return", episode_return, episode_step)
-            self.writer.add_scalar("charts/episodic_length", length, episode_step)
+            ended = {"charts/episodic_return": episode_return, "charts/episodic_length": length}
+            self.log_scalars(ended, episode_step)
             self.last_return = f"{episode_return:.1f}"
             if episode_step > 0.9 * self.args.total_timesteps:
                 self.progress.late_returns.append(episode_return)
-        for name, value in (scalars | {"charts/mujoco_warnings": len(mujoco_warnings)}).items():
-            self.writer.add_scalar(name, value, step)
+        self.log_scalars(scalars | {"charts/mujoco_warnings": len(mujoco_warnings)}, step)
         self.bar.set_postfix_str(f"return {self.last_return}, evaluation {self.last_evaluation}", refresh=False)
         self.bar.update(self.args.batch_size)
 
@@ -1242,8 +1304,8 @@ class Run:
         mean, std = mean_and_std(returns)
         progress.evaluations.append((step, mean, std, *map(float, (returns.min(), returns.max(), lengths.mean()))))
         self.write_evaluations()
-        for name, value in (("return_mean", mean), ("return_std", std), ("episode_length", lengths.mean())):
-            self.writer.add_scalar(f"eval/{name}", value, step)
+        scalars = {"return_mean": mean, "return_std": std, "episode_length": lengths.mean()}
+        self.log_scalars({f"eval/{name}": value for name, value in scalars.items()}, step)
         if mean > progress.best_return:
             progress.best_return = mean
             self.save("best.pt", agent, selection_return=mean)
@@ -1290,9 +1352,9 @@ class Run:
             self.exit_if_stopped()
             mean, std = mean_and_std(returns)
             final[name] = {"global_step": saved["global_step"], "returns": returns.tolist(), "mean": mean, "std": std}
-            # one step on: if a kill precedes result.json, the resumed run drops it
-            self.writer.add_scalar(f"final/{name}_mean", mean, progress.global_step + 1)
             say(f"{name}: return {mean:.1f} +- {std:.1f} at step {saved['global_step']:,}")
+        # one step on: if a kill precedes result.json, the resumed run drops it
+        self.log_scalars({f"final/{name}_mean": final[name]["mean"] for name in final}, progress.global_step + 1)
         self.writer.flush()
         final["best"]["selection_return"] = progress.best_return
         flags = ("env_id", "exp_name", "seed", "total_timesteps", "refinement_depth", "refinement_schedule")
