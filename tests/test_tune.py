@@ -254,7 +254,7 @@ def test_one_worker_searches(place):
     assert f"trial {number} ({best['source']}) of 14 is best with {float(best['value']):.2f}" in output
     for source, row in zip(("default", "published"), rows):
         assert re.search(rf"^    {source} +{float(row['value']):.2f}$", output, re.M)
-    lines = [line for line in output.splitlines() if line.startswith("trial ")]
+    lines = [line for line in output.splitlines() if " of 14 done, about " in line]
     assert len(lines) == 14 and f"best {float(best['value']):.2f}" in lines[-1]
 
     # the winner, as the scripts read it
