@@ -50,6 +50,7 @@ def global_step(path) -> int:
 
 # --- Signals ----------------------------------------------------------------------------------------------------------
 
+SLOW = pytest.mark.slow
 MOMENTS = {  # before which execution of which line, and the step at which the run then stops
     "start": (("training = run.begin_or_resume()", 1), None),
     "rollout": (("= envs.step(", 150), 192),
@@ -59,12 +60,13 @@ MOMENTS = {  # before which execution of which line, and the step at which the r
     "final evaluation": (("lengths[i] += 1", 1700), 512),
 }
 CASES = [
-    *(("rollout", signum) for signum in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, signal.SIGHUP)),
-    ("start", signal.SIGTERM),
-    ("update", signal.SIGINT),
+    ("rollout", signal.SIGHUP),
     ("evaluation", signal.SIGTERM),
-    ("checkpoint", signal.SIGUSR1),
-    ("final evaluation", signal.SIGINT),
+    *(pytest.param("rollout", signum, marks=SLOW) for signum in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)),
+    pytest.param("start", signal.SIGTERM, marks=SLOW),
+    pytest.param("update", signal.SIGINT, marks=SLOW),
+    pytest.param("checkpoint", signal.SIGUSR1, marks=SLOW),
+    pytest.param("final evaluation", signal.SIGINT, marks=SLOW),
 ]
 
 
@@ -103,6 +105,7 @@ def test_printed_command_continues(name, tmp_path):
     assert done.returncode == 0 and (run_dir / "result.json").exists(), done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signals", [(signal.SIGINT, signal.SIGINT), (signal.SIGTERM, signal.SIGINT)])
 @pytest.mark.parametrize(
     "at", [("lengths[i] += 1", 100), ("os.fsync(", 3), ("torch.func.grad(", 10)], ids=lambda at: at[0]
@@ -126,6 +129,7 @@ def test_a_reader_that_leaves_ends_no_training(name, tmp_path):
         assert (tmp_path / str(i) / "result.json").exists()
 
 
+@pytest.mark.slow
 def test_a_closed_terminal_under_nohup_stops_nothing(name, whole, tmp_path):
     def nohup():
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
@@ -161,7 +165,7 @@ def limit_files(size: int):
     return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
 
-@pytest.mark.parametrize("what", ["checkpoint", "log"])
+@pytest.mark.parametrize("what", ["checkpoint", pytest.param("log", marks=pytest.mark.slow)])
 def test_full_disk(name, what, whole, tmp_path):
     """One clear line, a failing exit code, and the checkpoint from before is whole and is continued from."""
     settings = {"actor_hidden": 64} if what == "checkpoint" else {"total_timesteps": 1536, "checkpoint_interval": 256}
@@ -253,6 +257,7 @@ def test_truncated_checkpoints_are_refused(script, stopped, tmp_path, capsys):
         assert is_refused(script, path, capsys), f"{size} of {len(data)} bytes"
 
 
+@pytest.mark.slow
 def test_flipped_bits_are_refused_or_harmless(script, stopped, tmp_path, capsys):
     """What no checksum covers (padding, dates) may flip, if what is loaded is the same to the last bit."""
     source, path, rng = stopped(f"{script.__name__}.py") / "last.pt", tmp_path / "last.pt", random.Random(0)
@@ -283,6 +288,7 @@ def longest_entry(path) -> bytes:
         return max(map(file.read, file.namelist()), key=len)
 
 
+@pytest.mark.slow
 def test_damaged_checkpoint_is_refused_by_the_command(name, stopped, tmp_path):
     """With --resume and with --evaluate; the file is left as it is."""
     shutil.copytree(stopped(name), tmp_path / "run")
@@ -306,6 +312,7 @@ class Malicious:
         return os.mkdir, (str(self.path),)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("legacy", [False, True], ids=["zip", "pickle"])
 def test_malicious_checkpoint_runs_nothing(legacy, stopped, tmp_path):
     """In any script that reads checkpoints. That it would run is shown by loading it without care."""
@@ -366,12 +373,12 @@ def failure(run_dir) -> dict:
 @pytest.mark.parametrize(
     "way, step, normalize",
     [
-        ("nan-reward", 23, True),
-        ("-inf-reward", 40, False),
-        ("nan-obs", 23, True),
-        ("inf-obs", 40, False),
         ("nan-obs", 0, True),
-        ("inf-obs", 0, False),
+        ("-inf-reward", 40, False),
+        pytest.param("nan-reward", 23, True, marks=SLOW),
+        pytest.param("nan-obs", 23, True, marks=SLOW),
+        pytest.param("inf-obs", 40, False, marks=SLOW),
+        pytest.param("inf-obs", 0, False, marks=SLOW),
     ],
 )
 def test_bad_number_in_a_rollout(script, way, step, normalize, whole, tmp_path):
@@ -401,6 +408,7 @@ def test_infinite_first_observation_of_all(script, tmp_path):
     assert "observation" in facts["what"] and (facts["env"], facts["episode_step"], facts["global_step"]) == (0, 0, 0)
 
 
+@pytest.mark.slow
 def test_crashing_environment(script, whole, tmp_path):
     """The simulator's own error is shown, and the run can be continued."""
     name, words = f"{script.__name__}.py", flags(tmp_path / "run", "--resume", **FAULTY)
