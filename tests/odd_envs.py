@@ -77,7 +77,7 @@ class OneBuffer(Line):
         return super().step(action)
 
 
-class DictObs(Line):
+class ObsInDict(Line):
     observation_space = Dict(place=Box(-np.inf, np.inf, (1,), float), time=Box(-np.inf, np.inf, (1, 1), float))
 
     def look(self):
@@ -85,14 +85,14 @@ class DictObs(Line):
         return {"time": np.array([[t]]), "place": np.array([x])}
 
 
-class TupleObs(Line):
+class ObsInTuple(Line):
     observation_space = Tuple([Box(-np.inf, np.inf, (1,), float)] * 2)
 
     def look(self):
         return tuple(super().look().reshape(2, 1))
 
 
-class GridObs(Line):
+class ObsInGrid(Line):
     observation_space = Box(-np.inf, np.inf, (2, 1), float)
 
     def look(self):

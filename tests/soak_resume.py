@@ -53,6 +53,7 @@ def random_settings(rng: random.Random) -> dict:
         "total_timesteps": batch * iterations + rng.randrange(batch),
         "eval_interval": batch * rng.randint(2, 6),
         "checkpoint_interval": batch * rng.choice((1, 1, 2, 3)),
+        "max_episode_steps": rng.choice((30, 100, 300)),
         "actor_hidden": rng.choice((16, 64)),
         "compile": rng.random() < 0.1,
     }

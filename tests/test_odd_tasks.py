@@ -12,6 +12,7 @@ from conftest import run
 from resume_helpers import SCRIPTS, Run, differences, finish, flags, flatten, killed_after, outcome, refusal
 from test_commands import QUICK, call_main
 
+SLOW = pytest.mark.slow
 SMALL = {"num_envs": 2, "num_steps": 50, "total_timesteps": 400, "learning_rate": 0.01}
 
 
@@ -59,7 +60,7 @@ def test_trains_like_its_sound_twin(script, task, twin, of_twin, tmp_path):
     assert differences(of_twin(script, twin), numbers(tmp_path / "run")) == []
 
 
-@pytest.mark.parametrize("task", ["ActionInPlace", "OneBuffer", "DictObs"])
+@pytest.mark.parametrize("task", ["ActionInPlace", *(pytest.param(x, marks=SLOW) for x in ("OneBuffer", "ObsInDict"))])
 def test_continues_exactly(name, task, tmp_path):
     killed_after(2, name, words(task, tmp_path / "run", "--resume"), tmp_path / "log")
     assert "warning: odd" not in finish(name, words(task, tmp_path / "run", "--resume"), tmp_path / "log")
@@ -68,7 +69,7 @@ def test_continues_exactly(name, task, tmp_path):
 
 
 def test_a_flattened_task_is_loaded(script, tmp_path, capsys):
-    call_main(script, *words("DictObs", tmp_path / "run"))
+    call_main(script, *words("ObsInDict", tmp_path / "run"))
     agent = script.load_agent(tmp_path / "run/best.pt")
     obs, _ = script.make_env(agent.args).reset(seed=3)
     assert obs.dtype == float and obs.shape == (2,) and agent.act(obs).shape == (1,)

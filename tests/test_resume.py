@@ -45,6 +45,8 @@ def whole(tmp_path_factory):
     return get
 
 
+SLOW = pytest.mark.slow
+
 # --- Killed runs ------------------------------------------------------------------------------------------------------
 
 KILLED = {
@@ -84,6 +86,7 @@ def test_killed_while_writing_anything(name, place, whole, tmp_path):
     assert differences(outcome(whole(name)), outcome(tmp_path / "run")) == []
 
 
+@pytest.mark.slow
 def test_killed_at_the_very_end(name, whole, tmp_path):
     """After the last checkpoint: in the final evaluation, its logs, result.json and what follows it."""
     words = flags(tmp_path / "run", "--resume", save_every=192)
@@ -122,7 +125,7 @@ def test_killed_by_the_clock(compiled, tmp_path):
 
 
 @pytest.mark.parametrize("episodes", [1, 3], ids=["first_episode", "later_episode"])
-@pytest.mark.parametrize("env_id", TASKS)
+@pytest.mark.parametrize("env_id", ["BipedalWalker-v3", "Hopper-v5", *(pytest.param(x, marks=SLOW) for x in TASKS)])
 def test_replay_is_exact(script, env_id, episodes):
     """Environments brought back by replay go on like those that they were saved from, to the last bit."""
     rng = np.random.default_rng(7)
@@ -198,6 +201,7 @@ def interrupted(tmp_path_factory):
     return folder, words
 
 
+@pytest.mark.slow
 def test_parts_are_all_that_is_saved(interrupted):
     saved = flatten("", torch.load(interrupted[0] / "19/last.pt"))
     known = *PARTS, *NOT_COMPARED
@@ -238,11 +242,14 @@ def contents(run_dir) -> dict:
     return {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in run_dir.iterdir()}
 
 
+FRESH = "missing", "empty", "without a checkpoint", "with other files"
+
+
 def edit(checkpoint, **changes):
     torch.save(torch.load(checkpoint) | changes, checkpoint)
 
 
-@pytest.mark.parametrize("folder", ["missing", "empty", "without a checkpoint", "without last.pt", "with other files"])
+@pytest.mark.parametrize("folder", ["without last.pt", *(pytest.param(x, marks=SLOW) for x in FRESH)])
 def test_resume_starts_from_the_beginning(name, folder, whole, tmp_path):
     run_dir, words = tmp_path / "deep/run", flags(tmp_path / "deep/run", "--resume", save_every=192)
     if folder == "without a checkpoint":
@@ -285,7 +292,7 @@ def test_other_flags_are_refused_by_name(name, killed, tmp_path):
     assert contents(run_dir) == before
 
 
-@pytest.mark.parametrize("config", ["missing", "torn", "as it was"])
+@pytest.mark.parametrize("config", ["torn", *(pytest.param(x, marks=SLOW) for x in ("missing", "as it was"))])
 def test_free_flags_and_config_json_change_nothing(name, config, killed, whole, tmp_path):
     run_dir, words = killed
     if config != "as it was":
@@ -323,6 +330,7 @@ def test_another_processor_or_commit_is_warned_of(name, killed, whole, tmp_path)
     assert differences(expected, found) == []
 
 
+@pytest.mark.slow
 def test_another_compile_mode_is_refused(name, tmp_path):
     """The flag is as before, but this time compilation fails; begun uncompiled, a run is not compiled later either."""
 

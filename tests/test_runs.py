@@ -48,6 +48,7 @@ def evaluations(run_dir: Path) -> list[dict[str, float]]:
 # --- Seeds ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_same_seed_same_numbers_in_another_process(script, tmp_path):
     flags = "--env-id Hopper-v5 --num-envs 2 --num-steps 64 --update-epochs 2 --total-timesteps 384 --eval-interval 128"
     flags = (*flags.split(), "--eval-episodes", 2)
@@ -148,6 +149,7 @@ def test_every_evaluation_has_seeds_of_its_own(script, tmp_path, recorded, monke
     assert not training & set(earlier + best_final + last_final)
 
 
+@pytest.mark.slow
 def test_saved_policy_evaluated_in_another_process(script, tmp_path):
     run_dir = train(script, tmp_path / "run", *EVALUATED.split(), "--seed", 3)
     result = read_json(run_dir / "result.json")
@@ -170,6 +172,7 @@ def test_tracked_policy_is_evaluated_without_wandb(script, tmp_path, monkeypatch
     assert "mean return" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_actions_in_another_process(script, tmp_path, monkeypatch):
     """The actions of the live agent, before it was ever saved, against those of last.pt in a new process."""
     original, actions = script.evaluate, []
