@@ -1,5 +1,5 @@
 # shellcheck shell=bash
-# Installs and starts what the sweep tests run on, on this machine alone: GNU parallel, a one-node Slurm, PostgreSQL.
+# Installs and starts what the tests run on, on this machine alone: GNU parallel, a one-node Slurm, PostgreSQL; OSMesa.
 # To be sourced: exports SLURM_CONF and REFINEPPO_TEST_POSTGRES; `stop_engines` ends and removes everything.
 # Needs Debian or Ubuntu and root; everything listens on 127.0.0.1.
 
@@ -24,7 +24,7 @@ as_postgres() {
 }
 
 missing=
-for package in parallel slurm-wlm munge postgresql; do
+for package in parallel slurm-wlm munge postgresql libosmesa6; do
     dpkg -s "$package" >/dev/null 2>&1 || missing+=" $package"
 done
 if [ -n "$missing" ]; then

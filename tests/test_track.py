@@ -46,7 +46,7 @@ def records(path: Path):
 def tracked(folder: Path) -> tuple[set[str], Counter, list[int]]:
     """The ids of W&B's runs, how often each (tag, step, value) was logged, and the exit codes."""
     ids, scalars, codes = set(), Counter(), []
-    for path in sorted(folder.glob("wandb/*/*.wandb")):
+    for path in sorted(folder.glob("wandb/offline-run-*/*.wandb")):
         for record in records(path):
             if record.WhichOneof("record_type") == "run":
                 ids.add(record.run.run_id)
