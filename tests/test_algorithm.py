@@ -114,7 +114,7 @@ def test_gradient_of_the_chain_against_finite_differences(schedule, depth):
 
 
 def test_refinement_scalars_by_hand():
-    """A saturated layer tells (s, m) = (1, m_0), (1, m_1), (-1, m_0) and (-1, m_1) apart; an eighth of the rows counts.
+    """A saturated layer tells (s, m) = (1, m_0), (1, m_1), (-1, m_0) and (-1, m_1) apart; a seventh of the rows counts.
 
     For s = 1: m_1 = m_2 = (3, 4); for s = -1: m_1 = (1, 0), m_2 = (5, -3).
     """
@@ -126,8 +126,8 @@ def test_refinement_scalars_by_hand():
     agent.params["actor.0.weight"][:] = 100 * torch.tensor([[1.0, 0, 0], [0, 1, 1], [0, 0, 0]])
     agent.params["actor.0.bias"][:] = 100 * torch.tensor([0, -0.5, -2])
     agent.params["actor.1.weight"][:], agent.params["actor.1.bias"][:] = corrections[:3], corrections[3]
-    obs = torch.full((16, 1), 9.0)
-    obs[0], obs[8] = 1, -1
+    obs = torch.full((14, 1), 9.0)
+    obs[0], obs[7] = 1, -1
     assert refineppo_continuous.refinement_scalars(agent, obs) == pytest.approx(
         {
             "refinement/correction_norm_1": (5 + 1) / 2,
