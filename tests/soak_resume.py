@@ -27,11 +27,11 @@ import ppo_continuous  # noqa: E402, F401  (every run is a fork of this process 
 
 PLACES = {  # pieces of the scripts' lines, and how often a process may execute one before it is interrupted
     "training = run.begin_or_resume()": 1,
-    "self.actions[i].append(": 8000,
-    "torch.from_numpy(rollout.obs)": 16,
-    "update_function(agent.params": 400,
-    "add_scalar(": 600,
-    "lengths[i] += 1": 10_000,
+    "self.actions[i].append(": 2000,
+    "torch.from_numpy(rollout.obs)": 8,
+    "update_function(agent.params": 100,
+    "add_scalar(": 200,
+    "lengths[i] += 1": 2000,
     "torch.save(state": 20,
     "os.fsync(": 30,
     "os.replace(": 30,

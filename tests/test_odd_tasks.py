@@ -128,13 +128,6 @@ def set_variable(name: str, value):
     return before
 
 
-def test_a_task_without_pictures_is_not_filmed(script, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(script, "find_spec", lambda _: True)
-    with pytest.raises(SystemExit):
-        call_main(script, *words("Line", tmp_path / "run", "--capture-video"))
-    assert "MUJOCO_GL" in capsys.readouterr().err and not (tmp_path / "run").exists()
-
-
 # --- Said, and trained ------------------------------------------------------------------------------------------------
 
 

@@ -62,13 +62,13 @@ KILLED = {
 @pytest.mark.slow
 @pytest.mark.parametrize("env_id", KILLED)
 def test_killed_at_random_lines(name, env_id, tmp_path):
-    """Five kills at lines of the loop, each in the first fifth of the line's executions: it comes before the end."""
+    """Three kills at lines of the loop, each in the first tenth of the line's executions: it comes before the end."""
     rng = random.Random(env_id + name)
     settings = KILLED[env_id] | {"env_id": env_id}
     executed = count_lines(name, flags(tmp_path / "whole", **settings), tmp_path / "log")
     words = flags(tmp_path / "killed", "--resume", **settings)
-    for line in rng.sample([line for line, n in executed.items() if n >= 5], 5):
-        killed = Run(name, words, tmp_path / "log", at=(line, rng.randint(1, executed[line] // 5)))
+    for line in rng.sample([line for line, n in executed.items() if n >= 10], 3):
+        killed = Run(name, words, tmp_path / "log", at=(line, rng.randint(1, executed[line] // 10)))
         assert killed.wait() == -signal.SIGKILL, killed.output()
     finish(name, words, tmp_path / "log")
     assert differences(outcome(tmp_path / "whole"), outcome(tmp_path / "killed")) == []
