@@ -1105,7 +1105,7 @@ def agent_of(checkpoint: dict, args: Args) -> Agent:
 # The run's folder
 
 FREE_ON_RESUME = {"resume", "run_dir", "progress", "track", "capture_video", "checkpoint_interval", "save_every"}
-RESUMED = {"adam", "envs", "rng", "progress", "compiled", "machine"}  # in last.pt alone
+RESUMED = {"adam", "envs", "rng", "progress", "compiled", "machine", "logs"}  # in last.pt alone
 
 
 def describe_machine() -> dict:
@@ -1209,6 +1209,9 @@ class Run:
         training, saved = Training(self.args), self.checkpoint
         if saved:
             training.load(saved)
+            for path in self.dir.glob("events.out.tfevents.*"):
+                if path.name not in saved["logs"]:  # begun after the checkpoint: all in it will be logged again
+                    path.unlink()
         progress = self.progress = training.progress
         self.start -= progress.wall_seconds  # the time of a resumed run's earlier parts counts too
         self.write_evaluations()
@@ -1329,7 +1332,9 @@ class Run:
         """The checkpoint that continues the run."""
         self.writer.flush()
         self.progress.wall_seconds = time.time() - self.start
-        self.save("last.pt", training.agent, **training.state(), compiled=self.compiled, machine=self.machine)
+        logs = [path.name for path in self.dir.glob("events.out.tfevents.*")]
+        more = {"compiled": self.compiled, "machine": self.machine, "logs": logs}
+        self.save("last.pt", training.agent, **training.state(), **more)
 
     def exit_if_stopped(self):
         """Exit if a signal has asked for it, and say how to go on."""

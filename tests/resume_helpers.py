@@ -218,6 +218,7 @@ def outcome(run_dir: Path) -> dict[str, str]:
     for path in run_dir.glob("*.pt"):
         state = torch.load(path, weights_only=True)
         del state["args"]  # they hold --resume and --run-dir
+        state.pop("logs", None)  # names with the time in them
         for timing in ("train_seconds", "wall_seconds"):
             state.get("progress", {}).pop(timing, None)
         found |= flatten(path.name, state)

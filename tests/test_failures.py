@@ -263,7 +263,7 @@ def test_incomplete_checkpoint_is_refused(name, missing, stopped, tmp_path):
     refusal(name, ["--evaluate", tmp_path / "best.pt"], tmp_path / "log")
 
 
-@pytest.mark.parametrize("missing", ["adam", "envs", "rng", "progress", "compiled", "machine"])
+@pytest.mark.parametrize("missing", ["adam", "envs", "rng", "progress", "compiled", "machine", "logs"])
 def test_checkpoint_without_a_part_cannot_be_resumed(name, missing, stopped, tmp_path):
     shutil.copytree(stopped(name), tmp_path / "run")
     state = torch.load(tmp_path / "run/last.pt")

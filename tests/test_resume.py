@@ -22,6 +22,7 @@ from resume_helpers import (
     killed_after,
     outcome,
     refusal,
+    send,
 )
 
 
@@ -97,6 +98,16 @@ def test_killed_at_the_very_end(name, whole, tmp_path):
         place = {"at": ('"result.json", json.dumps', 1), "after": ("result.json", 1)}[word]
         assert Run(name, words, tmp_path / "log", **{word: place}).wait() == -signal.SIGKILL
     assert "is finished" in finish(name, words, tmp_path / "log")
+    assert differences(outcome(whole(name)), outcome(tmp_path / "run")) == []
+
+
+def test_an_evaluation_that_is_made_up_for_is_logged_once(name, whole, tmp_path):
+    """A signal ends it; the next process makes it and logs it, and is killed before it can save that."""
+    words = flags(tmp_path / "run", "--resume", save_every=192)
+    stopped = Run(name, words, tmp_path / "log", at=("lengths[i] += 1", 100), action=send(signal.SIGTERM))
+    assert stopped.wait() == 75, stopped.output()
+    assert Run(name, words, tmp_path / "log", at=("run.save_last(training)", 1)).wait() == -signal.SIGKILL
+    finish(name, words, tmp_path / "log")
     assert differences(outcome(whole(name)), outcome(tmp_path / "run")) == []
 
 
@@ -179,7 +190,7 @@ PARTS = [
 ]
 # of the timings nothing depends; obs and returns are there to be compared, machine and compiled decide a refusal
 NOT_COMPARED = "args", "global_step", "compiled", "machine", "progress/train_seconds", "progress/wall_seconds"
-NOT_COMPARED += "envs/obs", "envs/returns", "progress/wandb_id"
+NOT_COMPARED += "logs", "envs/obs", "envs/returns", "progress/wandb_id"
 
 
 @pytest.fixture(scope="module")
