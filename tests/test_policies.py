@@ -1,0 +1,38 @@
+"""The policies that are kept in sweeps/results/policies return what the table of runs says of them."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from conftest import ROOT
+from threadpoolctl import threadpool_info
+
+from refineppo_continuous import Args, agent_of, describe_machine, evaluate, evaluation_seeds, load_checkpoint
+
+RESULTS = ROOT / "sweeps/results"
+POLICIES = sorted(RESULTS.glob("policies/*.pt"))
+
+
+def test_there_are_policies():
+    assert POLICIES
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", POLICIES, ids=lambda path: path.stem)
+def test_a_kept_policy_returns_what_the_table_says(path):
+    """Digit for digit with the table's processor and versions; elsewhere its mean is within the spread of episodes."""
+    runs = (
+        pd.read_csv(RESULTS / "benchmark/runs.csv", dtype=str, keep_default_na=False).set_index("task").loc[[path.stem]]
+    )
+    kept = (runs.method == "RefinePPO") & (runs.depth == "4") & (runs.schedule == "average") & (runs.seed == "1")
+    (row,) = (row for _, row in runs[kept].iterrows())
+    checkpoint = load_checkpoint(path)
+    args = Args(**checkpoint["args"])
+    assert checkpoint["global_step"] == int(row.best_global_step)
+    returns, _ = evaluate(agent_of(checkpoint, args), evaluation_seeds(args, checkpoint["global_step"], final=True))
+    machine = describe_machine()
+    versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
+    kernels = {library.get("architecture") for library in threadpool_info()} - {None}
+    if (machine["cpu"], versions, kernels) == (row.cpu, row.versions, {"SkylakeX"}):  # OpenBLAS's, where it was trained
+        assert " ".join(map(repr, returns.tolist())) == row.best_returns
+    else:
+        assert abs(np.mean(returns) - float(row.best_mean)) <= 3 * float(row.best_std)
