@@ -631,6 +631,7 @@ def main():
         update_function = run.compile(training)
         if run.evaluate_if_due(agent):  # a resumed run makes up for the one that a signal ended
             run.save_last(training)
+        run.exit_if_stopped()
         while progress.global_step < args.last_step:
             start, before = time.time(), progress.global_step
             seed_global_rng(*episode_seeds(args.seed, 2, before))
