@@ -1214,6 +1214,8 @@ class Run:
             refuse(f"another process is at work in {self.dir}")
         except NotImplementedError:  # this file system has no locks
             pass
+        except OSError as error:
+            refuse(f"cannot write to the run folder {self.dir}: {error.strerror}")
 
     def find_checkpoint(self) -> dict | None:
         """last.pt, if the run can go on from there; exits if it is finished, refuses if it is another one's."""
