@@ -36,6 +36,14 @@ def duration(seconds: float) -> str:
     return f"{seconds:.0f} s"
 
 
+def steps_text(steps: int) -> str:
+    """1M, 50k, 8192."""
+    for unit, size in (("M", 10**6), ("k", 10**3)):
+        if steps % size == 0:
+            return f"{steps // size}{unit}"
+    return str(steps)
+
+
 def write_atomically(path: Path, text: str):
     """Replace a file in one step, whatever other processes write at the same time."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -25,7 +25,7 @@ from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
 
-from common import ROOT, refuse
+from common import ROOT, refuse, steps_text
 from flags import default_args, file_name, parse, settings_file, words
 
 HERE = ROOT / "sweeps"
@@ -137,13 +137,6 @@ def args_of_run(algorithm: str, task: str, seed: int, varied: dict):
     args = with_flags(algorithm, task)
     refuse_changes(varied, args, settings(algorithm, task), "FLAGS")
     return replace(args, env_id=task, seed=seed, total_timesteps=int(given("STEPS", "6000000")), **varied)
-
-
-def steps_text(steps: int) -> str:
-    for unit, size in (("M", 10**6), ("k", 10**3)):
-        if steps % size == 0:
-            return f"{steps // size}{unit}"
-    return str(steps)
 
 
 def flag_text(name: str, value) -> str:

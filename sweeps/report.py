@@ -35,12 +35,12 @@ import jinja2
 import numpy as np
 import pandas as pd
 import tyro
-from common import refuse
+from common import refuse, steps_text
 from flags import words
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FixedLocator
-from run_tables import Cell, Run, actor_cost, as_tables, merge, rate_ratio, read_source, short, sort_into_cells, typed
+from run_tables import Cell, Run, actor_cost, as_tables, merge, rate_ratio, read_source, sort_into_cells, typed
 from scipy.stats import spearmanr, trim_mean
 
 HERE = Path(__file__).resolve().parent
@@ -678,7 +678,7 @@ def make_report(runs: pd.DataFrame, evaluations: pd.DataFrame, args: Args) -> di
     sections = settings, baseline, training_curves, sample_efficiency, table_2, depth_figure, few_seeds, controls
     with rc_context(STYLE):
         for steps in sorted({*finished.steps}, key=lambda steps: (-(finished.steps == steps).sum(), steps)):
-            e, report = Experiment(finished[finished.steps == steps], evaluations, args), Report(short(steps))
+            e, report = Experiment(finished[finished.steps == steps], evaluations, args), Report(steps_text(steps))
             action_dimension(report, table_1(e, report))
             for section in (*sections, learning_rates, variants, toy, cost):
                 section(e, report)
@@ -702,7 +702,7 @@ def earlier_files(folder: Path) -> set[str]:
 
 def check_folder(folder: Path, found: dict[str, Run]):
     """Make the output folder; refuse to overwrite what no report has made, and to lose an earlier one's runs."""
-    of_steps = {short(int(run.row["steps"])) for run in found.values()}
+    of_steps = {steps_text(int(run.row["steps"])) for run in found.values()}
     ours = [folder / name for name in ("report.md", "runs.csv", "evaluations.csv")]
     ours += [path for name in of_steps for path in (folder / name).glob("[!.]*")]
     earlier = earlier_files(folder)

@@ -234,14 +234,6 @@ def actor_cost(run, obs_dim: int, action_dim: int) -> dict[str, int]:
     }
 
 
-def short(steps: int) -> str:
-    """1M, 50k, 8192."""
-    for unit, size in (("M", 10**6), ("k", 10**3)):
-        if steps % size == 0:
-            return f"{steps // size}{unit}"
-    return str(steps)
-
-
 def sort_into_cells(runs: pd.DataFrame) -> tuple[dict[Cell, list], dict[tuple[str, str], frozenset[str]], list[str]]:
     """Finished runs of one number of steps as {cell: rows, a seed each}; {(task, method): settings}; seeds again.
 
