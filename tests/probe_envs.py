@@ -11,22 +11,14 @@ the action is ignored:
     Counter-v0          truncated after 7 steps (max_episode_steps)
     Terminator-v0       terminated after 5 steps
 
-Failures; episodes of 50 steps, and 100 sound steps over all episodes, counted from the environment's making:
-    NanReward-v0        then every reward is NaN
-    InfReward-v0        then every reward is infinite
-    NanObs-v0           then every observation is NaN
-    NanFirstObs-v0      sound but for the first observation of the third episode in the third copy that is made
-
 Spaces; episodes of 50 steps with reward 0:
     Unbounded-v0        two actions without bounds
     Discrete-v0         two discrete actions, unsupported
-    DictObs-v0          observations in a dict
-    ImageObs-v0         observations of three dimensions
 """
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.spaces import Box, Dict, Discrete
+from gymnasium.spaces import Box, Discrete
 
 
 class Probe(gym.Env):
@@ -97,41 +89,6 @@ class Terminator(Counter):
     last_step = 5
 
 
-class Failing(Probe):
-    steps, bad_reward, bad_obs = 0, 0.0, 0.0
-
-    def step(self, action):
-        self.steps += 1
-        obs, reward, *rest = super().step(action)
-        return (obs, reward, *rest) if self.steps <= 100 else (obs + self.bad_obs, self.bad_reward, *rest)
-
-
-class NanReward(Failing):
-    bad_reward = np.nan
-
-
-class InfReward(Failing):
-    bad_reward = np.inf
-
-
-class NanObs(Failing):
-    bad_obs = np.nan
-
-
-class NanFirstObs(Probe):
-    made = 0
-
-    def __init__(self, render_mode=None):
-        super().__init__(render_mode)
-        NanFirstObs.made += 1
-        self.number, self.episodes = NanFirstObs.made, 0
-
-    def reset(self, seed=None, options=None):
-        obs, info = super().reset(seed=seed)
-        self.episodes += 1
-        return (obs * np.nan if (self.number, self.episodes) == (3, 3) else obs), info
-
-
 class Unbounded(Probe):
     action_space = Box(-np.inf, np.inf, (2,))
 
@@ -140,23 +97,8 @@ class DiscreteActions(Probe):
     action_space = Discrete(2)
 
 
-class DictObs(Probe):
-    observation_space = Dict(position=Box(-1, 1, (1,)))
-
-    def observe(self):
-        return {"position": self.np_random.uniform(-1, 1, 1).astype(np.float32)}
-
-
-class ImageObs(Probe):
-    observation_space = Box(0, 255, (8, 8, 3), np.uint8)
-
-    def observe(self):
-        return self.np_random.integers(0, 256, (8, 8, 3), np.uint8)
-
-
 for env in (ConstantReward, MatchAction, TwoStepCredit, Terminator):
     gym.register(f"{env.__name__}-v0", env)
 gym.register("Counter-v0", Counter, max_episode_steps=7)
 gym.register("Discrete-v0", DiscreteActions, max_episode_steps=50)
-for env in (NanReward, InfReward, NanObs, NanFirstObs, Unbounded, DictObs, ImageObs):
-    gym.register(f"{env.__name__}-v0", env, max_episode_steps=50)
+gym.register("Unbounded-v0", Unbounded, max_episode_steps=50)
