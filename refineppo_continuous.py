@@ -325,7 +325,7 @@ class Environments:
         for i, action in enumerate(actions):
             obs, reward, terminal, timeout = self.step_one(i, action)
             if terminal or timeout:
-                ended[i] = obs, self.returns[i], len(self.actions[i])
+                ended[i] = obs.copy(), self.returns[i], len(self.actions[i])
                 obs = self.reset(i)
             self.obs[i] = obs
             rewards.append(reward)
@@ -415,8 +415,8 @@ class Normalizer:
     def normalize(self, obs: np.ndarray) -> np.ndarray:
         """Raw observations (n, obs_dim), normalised and clipped to +-10 in float32, with the statistics as they are."""
         if self.args.normalize_obs:
-            std = np.sqrt(self.obs.squares / self.obs.count.item() + 1e-8)
-            obs = np.minimum(np.maximum((obs - self.obs.mean) / std, -10.0), 10.0)  # np.clip is slower
+            mean, squares = self.obs.mean[None], self.obs.squares[None]
+            obs = ((obs - mean) / np.sqrt(squares / self.obs.count.item() + 1e-8)).clip(-10.0, 10.0)
         return obs.astype(np.float32)
 
     def scale_rewards(self, rewards: np.ndarray, terminated: np.ndarray) -> np.ndarray:
@@ -473,7 +473,8 @@ def collect(agent: Agent, envs: Environments, num_steps: int, rng: np.random.Gen
     """
     mujoco_warnings.clear()  # those of this rollout are logged with it
     arrays, coefficients = agent.arrays(), refinement_coefficients(agent.args)
-    weights, log_std, obs = layers(arrays, "actor"), arrays["log_std"], agent.normalizer.normalize(envs.obs)
+    log_std, obs = arrays["log_std"], agent.normalizer.normalize(envs.obs)
+    weights = [(w, b[None]) for w, b in layers(arrays, "actor")]  # NumPy adds a row to a row in half of a vector's time
     noise = rng.standard_normal((num_steps, len(obs), len(log_std)), dtype=np.float32)
     perturbation = noise * np.exp(log_std)
     # the density of a depends on the noise alone: a - mean = exp(log_std) * noise
@@ -483,7 +484,7 @@ def collect(agent: Agent, envs: Environments, num_steps: int, rng: np.random.Gen
     for t in range(num_steps):
         all_obs[t] = obs
         actions[t] = proposals(weights, coefficients, obs)[-1] + perturbation[t]
-        raw_obs, *outcome, ended = envs.step(np.minimum(np.maximum(actions[t], agent.low), agent.high))
+        raw_obs, *outcome, ended = envs.step(actions[t].clip(agent.low, agent.high))
         outcomes.append(outcome)
         if ended:  # last observations are counted too, before the ones that follow, as in gymnasium's wrapper
             last_obs = agent.normalizer.observe(np.stack([last for last, _, _ in ended.values()]))
@@ -802,9 +803,9 @@ def check_finite(what: str, numbers: dict):
 class Task(gym.Wrapper):
     """One environment, held to what its spaces promise: all that comes from a task passes here.
 
-    Observations become float64 arrays of the space's shape (else ValueError), rewards floats, ends bools; the task gets
-    an action of its own in the space's dtype, which it may change. A number that is not finite raises NotFinite with
-    the episode's seed and the step in it, which replay it, and with `facts`.
+    Observations become float64 arrays of the space's shape (else ValueError), which the next step may overwrite,
+    rewards floats, ends bools; the task gets an action of its own in the space's dtype, which it may change. A number
+    that is not finite raises NotFinite with the episode's seed and the step in it, which replay it, and with `facts`.
     """
 
     def __init__(self, env: gym.Env, facts: dict):
@@ -824,11 +825,11 @@ class Task(gym.Wrapper):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         self.facts["episode_step"] += 1
         obs, reward, terminated, truncated, info = ask(self.env.step, np.array(action, self.action_dtype))
-        reward = np.asarray(reward, float).item()
+        reward = float(reward) if isinstance(reward, float) else np.asarray(reward, float).item()  # the usual is fast
         return self.checked(obs, reward), reward, bool(terminated), bool(truncated), info
 
     def checked(self, obs, reward: float = 0.0) -> np.ndarray:
-        obs = np.array(obs, float)  # a copy: the task may go on writing into its own
+        obs = np.asarray(obs, float)
         if obs.shape != self.obs_shape:
             raise ValueError(f"an observation has the shape {obs.shape}, where the space promises {self.obs_shape}")
         if not math.isfinite(obs.dot(obs) + reward):  # the square of a large number may be infinite: look closer
