@@ -1410,3 +1410,19 @@ if __name__ == "__main__":
     finally:
         for task in list(open_tasks):
             task.close()
+
+# What `uv run` and `pipx run` install to run this file alone (inline script metadata, PEP 723):
+# /// script
+# requires-python = ">=3.11"
+# dependencies = [
+#     "torch==2.13.0",
+#     "gymnasium[mujoco,box2d]==1.4.0",
+#     "mujoco>=4.0,<5",
+#     "numpy>=2.0",
+#     "tensorboard>=2.21",
+#     "tyro>=1.0",
+#     "tqdm>=4.66",
+#     "threadpoolctl>=3.1",
+#     "filelock>=3.16",
+# ]
+# ///

@@ -9,6 +9,7 @@ import shutil
 import signal
 import sys
 import sysconfig
+import tomllib
 from dataclasses import fields
 from pathlib import Path
 from unittest import mock
@@ -182,6 +183,18 @@ def test_the_home_folder(script, tmp_path, monkeypatch, capsys):
     call_main(script, "--evaluate=~/x/best.pt")
     assert "mean return" in capsys.readouterr().out
     assert [path.name for path in tmp_path.iterdir()] == ["x"] and (tmp_path / "x/result.json").exists()
+
+
+def test_a_copied_file_names_what_it_imports(script):
+    """PEP 723's block, read as its reference implementation does, against the imports and pyproject."""
+    text, project = Path(script.__file__).read_text(), tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    (block,) = re.findall(r"(?m)^# /// script$\s((?:^#(?:| .*)$\s)+)^# ///$", text)
+    metadata = tomllib.loads("".join(line.removeprefix("#").removeprefix(" ") for line in block.splitlines(True)))
+    names = {alias.name for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Import) for alias in node.names}
+    names |= {node.module for node in ast.walk(ast.parse(text)) if isinstance(node, ast.ImportFrom)}
+    imported = {name.split(".")[0] for name in names} | {"tensorboard"}  # torch.utils.tensorboard's
+    needed = [item for item in project["dependencies"] if re.match(r"[\w-]+", item)[0].replace("-", "_") in imported]
+    assert metadata == {"requires-python": project["requires-python"], "dependencies": needed}
 
 
 def test_help_explains_every_flag(script):
