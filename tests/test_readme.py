@@ -112,6 +112,8 @@ def run_command(words: list[str], folder: Path):
 @pytest.mark.slow
 def test_every_command_and_snippet(tmp_path):
     ran = []
+    (tmp_path / "sweeps/results").mkdir(parents=True)
+    (tmp_path / "sweeps/results/policies").symlink_to(ROOT / "sweeps/results/policies")
     for language, content in blocks(readme()):
         if language == "python":
             assert output("-c", content, folder=tmp_path).strip()
