@@ -415,7 +415,7 @@ class Normalizer:
     def normalize(self, obs: np.ndarray) -> np.ndarray:
         """Raw observations (n, obs_dim), normalised and clipped to +-10 in float32, with the statistics as they are."""
         if self.args.normalize_obs:
-            mean, squares = self.obs.mean[None], self.obs.squares[None]
+            mean, squares = self.obs.mean[None], self.obs.squares[None]  # rows: see `collect`
             obs = ((obs - mean) / np.sqrt(squares / self.obs.count.item() + 1e-8)).clip(-10.0, 10.0)
         return obs.astype(np.float32)
 
@@ -825,7 +825,7 @@ class Task(gym.Wrapper):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         self.facts["episode_step"] += 1
         obs, reward, terminated, truncated, info = ask(self.env.step, np.array(action, self.action_dtype))
-        reward = float(reward) if isinstance(reward, float) else np.asarray(reward, float).item()  # the usual is fast
+        reward = np.asarray(reward, float).item()
         return self.checked(obs, reward), reward, bool(terminated), bool(truncated), info
 
     def checked(self, obs, reward: float = 0.0) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Fixtures shared by all tests. The scripts are imported as modules; their commands run as a user types them."""
 
+import ast
 import os
 import subprocess
 import sys
@@ -35,6 +36,13 @@ def python(*words, cwd=ROOT, timeout=600, **env) -> subprocess.CompletedProcess:
 def run(name: str, *flags, **options) -> subprocess.CompletedProcess:
     """The script NAME with these flags, as `python` runs it."""
     return python(ROOT / name, *flags, **options)
+
+
+def imports(source: str) -> set[str]:
+    """The modules that a program's text imports, anywhere in it."""
+    nodes = list(ast.walk(ast.parse(source)))
+    names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    return names | {node.module for node in nodes if isinstance(node, ast.ImportFrom)}
 
 
 def policy_mean(module, params: dict, args, obs):

@@ -17,7 +17,7 @@ from unittest import mock
 import gymnasium as gym
 import pytest
 import torch
-from conftest import ROOT, run
+from conftest import ROOT, imports, run
 from resume_helpers import SCRIPTS, TASKS
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
@@ -190,9 +190,7 @@ def test_a_copied_file_names_what_it_imports(script):
     text, project = Path(script.__file__).read_text(), tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     (block,) = re.findall(r"(?m)^# /// script$\s((?:^#(?:| .*)$\s)+)^# ///$", text)
     metadata = tomllib.loads("".join(line.removeprefix("#").removeprefix(" ") for line in block.splitlines(True)))
-    names = {alias.name for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Import) for alias in node.names}
-    names |= {node.module for node in ast.walk(ast.parse(text)) if isinstance(node, ast.ImportFrom)}
-    imported = {name.split(".")[0] for name in names} | {"tensorboard"}  # torch.utils.tensorboard's
+    imported = {name.split(".")[0] for name in imports(text)} | {"tensorboard"}  # torch.utils.tensorboard's
     needed = [item for item in project["dependencies"] if re.match(r"[\w-]+", item)[0].replace("-", "_") in imported]
     assert metadata == {"requires-python": project["requires-python"], "dependencies": needed}
 

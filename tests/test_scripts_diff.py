@@ -9,6 +9,7 @@ import difflib
 from pathlib import Path
 
 import pytest
+from conftest import imports
 
 ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "tests" / "refinement.diff"
@@ -87,15 +88,8 @@ def test_page_by_hand():
 
 @pytest.mark.parametrize("source, other", [(PPO, "refineppo_continuous"), (REFINEPPO, "ppo_continuous")])
 def test_neither_script_imports_the_other(source, other):
-    names = set()
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            names |= {node.module}
-        elif isinstance(node, ast.Constant):  # import_module("...")
-            names |= {node.value}
-    assert other not in names
+    constants = {node.value for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Constant)}
+    assert other not in imports(source) | constants  # import_module("...")
 
 
 if __name__ == "__main__":
