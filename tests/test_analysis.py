@@ -358,6 +358,7 @@ def feedback(policy: Policy, seed=0) -> tuple[np.ndarray, np.ndarray, dict[str, 
     return obs, proposals, {row["reads"]: row for row in rows}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("schedule", ["average", "uniform", "inverse"])
 def test_feedback_equals_plain_episodes(schedule, small):
     """Every f(s, .) written out: what it reads is replaced, the corrections add up as before."""
@@ -399,6 +400,7 @@ def test_a_policy_that_does_not_read_its_proposals_loses_nothing(small):
     assert rows["one_pass"]["return_mean"] == pytest.approx(rows["own"]["return_mean"], rel=0.05)
 
 
+@pytest.mark.slow
 def test_feedback_repeats_itself_and_depends_on_the_seed(small):
     policy = task_policy("Pendulum-v1", scale=30, reads=3)
     (_, _, first), (_, _, again), (_, _, other) = (feedback(policy, seed) for seed in (0, 0, 1))

@@ -126,6 +126,7 @@ def test_the_papers_two_analyses_are_the_default(tmp_path, analyse, capsys):
     assert late in printed and str(out) in printed
 
 
+@pytest.mark.slow
 def test_every_section_of_seventeen_actions(tmp_path, analyse, capsys):
     """HumanoidStandup-v5 with short episodes: five early and five late components, all named after their joints."""
     gym.register("ShortStandup-v0", "gymnasium.envs.mujoco.humanoidstandup_v5:HumanoidStandupEnv", max_episode_steps=8)
@@ -160,6 +161,7 @@ def test_a_section_alone(section, tmp_path, analyse):
     assert set(json.loads((tmp_path / "analysis/summary.json").read_text())) == {"flags", "checkpoints", section}
 
 
+@pytest.mark.slow
 def test_the_same_command_gives_the_same_tables(tmp_path, analyse):
     path = save(tmp_path / "best.pt")
     for out in ("a", "b"):
@@ -179,6 +181,7 @@ def test_the_same_command_gives_the_same_tables(tmp_path, analyse):
         assert (tmp_path / f"a/{name}.csv").read_bytes() == (tmp_path / f"b/{name}.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_seeds_of_one_setting(tmp_path, analyse):
     """Each seed's own rows as if analysed alone, and beside them the mean and standard deviation across seeds."""
     paths = [save(tmp_path / f"seed-{seed}/best.pt", seed=seed) for seed in (1, 2, 3)]
@@ -204,6 +207,7 @@ def test_seeds_of_one_setting(tmp_path, analyse):
     assert list(json.loads((out / "summary.json").read_text())["settling"]) == list(map(str, paths))
 
 
+@pytest.mark.slow
 def test_a_run_through_training(tmp_path, analyse):
     """Two seeds at two steps each: their own rows, and mean and std over the seeds at every training step. The return
     lost is that of the section `feedback`."""
@@ -371,6 +375,7 @@ def test_a_full_disk_is_one_sentence(tmp_path, analyse, capsys, monkeypatch):
 # --- The commands -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_training_and_then_its_analysis_as_a_user_types_them(tmp_path):
     """A run of two iterations with --save-every; anytime at k = K is the mean of the run's own result.json."""
     run_dir = tmp_path / "run"

@@ -410,6 +410,7 @@ def test_a_row_of_each_table(tmp_path, make_report):
     assert row == "a run,100,0.0,1.0,-1.0,1.0,50.0"
 
 
+@pytest.mark.slow
 def test_the_tables_alone_make_the_same_report(whole):
     """Byte for byte: from runs.csv, and in its own folder mixed with the folders of half the runs, in another order."""
     for folder in sorted((whole / "runs").iterdir())[::2]:
@@ -589,6 +590,7 @@ def test_bootstrap_of_the_iqm(strata, monkeypatch):
     assert (low, high) == pytest.approx([plain_quantile(values, q) for q in (0.025, 0.975)])
 
 
+@pytest.mark.slow
 def test_bootstrap_agrees_with_scipy(strata):
     scores = strata[2]
     options = {"method": "percentile", "n_resamples": 20_000, "rng": 1}
@@ -654,6 +656,7 @@ def assert_shows_something(path: Path):
     assert len(np.unique(pixels[..., :3].reshape(-1, 3), axis=0)) > 20
 
 
+@pytest.mark.slow
 def test_every_file_of_a_report(whole):
     """Markdown, CSV and LaTeX of each table, PNG and PDF of each figure, all linked."""
     out = whole / "runs/report"

@@ -103,6 +103,7 @@ SWEEPS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", SWEEPS)
 def test_a_sweep_is_complete(script):
     steps, tasks, methods = SWEEPS[script]
@@ -140,6 +141,7 @@ def test_a_run_has_one_command_in_all_sweeps():
     assert shared == {(task, seed) for task in MUJOCO for seed in range(1, 6)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "flags, name",
     [
@@ -164,6 +166,7 @@ def test_a_folder_says_what_distinguishes_a_run(flags, name):
     assert {k: v for k, v in vars(given).items() if k not in own}.items() <= vars(parse(ppo)).items()
 
 
+@pytest.mark.slow
 def test_tasks_seeds_steps_and_folders_can_be_chosen(tmp_path):
     chosen = {"SEEDS": "7 11", "STEPS": "4096", "HOME": str(tmp_path)}
     lines = generate("benchmark.sh", "Hopper-v5", "Pendulum-v1", RUNS_DIR="~/my runs", **chosen)
@@ -177,6 +180,7 @@ def test_tasks_seeds_steps_and_folders_can_be_chosen(tmp_path):
     assert not any(tmp_path.iterdir())  # a generator prints and does nothing else
 
 
+@pytest.mark.slow
 def test_runs_that_are_done_are_left_out(tmp_path):
     lines = generate("benchmark.sh", "Hopper-v5", "Ant-v5")
     done = [folders(lines)[2], "Maze-v0__ppo__6M__1"]
@@ -186,6 +190,7 @@ def test_runs_that_are_done_are_left_out(tmp_path):
         assert left == lines[:2] + lines[3:]
 
 
+@pytest.mark.slow
 def test_settings_files(tmp_path):
     for algorithm, text in (
         ("ppo", "--gamma 0.999  # published for this task\n\n--num_envs 4\n--num-steps=512\n"),
@@ -212,6 +217,7 @@ def test_settings_files(tmp_path):
     assert (over.gamma, over.num_envs) == (0.5, 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "text, names",
     {
@@ -228,6 +234,7 @@ def test_settings_that_would_mislead_are_refused(text, names, tmp_path):
     check_refused(done, names, "refineppo/Hopper-v5.args")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words, names, settings",
     [
@@ -302,6 +309,7 @@ def joblog(folder: Path) -> dict[str, list[int]]:
     return codes
 
 
+@pytest.mark.slow
 def test_exit_codes_decide(engine, tmp_path):
     """0, 2 and 3 end a job; everything else is tried three times in all; a job that recovers is done."""
     codes = {f"sh -c 'echo says {code}; exit {code}'": code for code in (0, 1, 2, 3, 75, 137)}
@@ -367,6 +375,7 @@ def test_paths_with_blanks(engine, tmp_path):
     assert (tmp_path / "runs" / "fine.log").read_text() == "fine\n"
 
 
+@pytest.mark.slow
 def test_a_killed_executor_takes_its_trainings_along(engine, tmp_path):
     """kill -9 of all that runs the jobs: the training saves and stops, and the same command continues."""
     lines, long = tiny_sweep(tmp_path)
@@ -464,6 +473,7 @@ def check_tiny_sweep(folder: Path, lines: list[str], long: Path):
     assert all(torch.equal(params[name], values) for name, values in expected[0].items())
 
 
+@pytest.mark.slow
 def test_a_local_sweep_is_killed_stopped_and_continued(engine, tmp_path):
     """kill -9 of one training is repaired by a new attempt; Ctrl-C in a terminal, and the same command goes on."""
     lines, long = tiny_sweep(tmp_path)

@@ -82,6 +82,7 @@ def offline(monkeypatch, tmp_path):
     monkeypatch.setenv("WANDB_MODE", "offline")
 
 
+@pytest.mark.slow
 def test_every_number_arrives_once_also_after_a_stop(tmp_path):
     process = start(tmp_path, "--track")
     process.send_signal(signal.SIGTERM)
@@ -99,6 +100,7 @@ def test_every_number_arrives_once_also_after_a_stop(tmp_path):
     assert list(shown.Runs()) == ["runs/one"]
 
 
+@pytest.mark.slow
 def test_tracked_from_a_resume_on(tmp_path):
     process = start(tmp_path)
     process.send_signal(signal.SIGTERM)
@@ -117,6 +119,7 @@ def test_no_key(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} <= {"home"}
 
 
+@pytest.mark.slow
 def test_training_outlives_wandb(tmp_path):
     process = start(tmp_path, "--track")
     subprocess.run(["pkill", "-KILL", "-P", str(process.pid), "wandb-core"], check=True)

@@ -226,6 +226,7 @@ def test_every_point_of_the_space_can_be_trained(script):
 # --- Workers ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_one_worker_searches(place):
     output = place.tune("--algorithm", "refineppo", "--trials", 14, "--seeds", 2)
     rows = place.rows("HalfCheetah-v5__refineppo")
@@ -278,6 +279,7 @@ def test_a_dry_run_states_the_cost_and_leaves_nothing(place):
     assert sorted(place.path.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_both_methods_are_searched_alike(place):
     place.tune("--trials", 6)
     place.tune("--trials", 6, "--algorithm", "refineppo")
@@ -298,6 +300,7 @@ def test_a_fixed_depth_is_an_arm_of_its_own(place):
     assert not (place.path / "runs/tune/settings").exists()
 
 
+@pytest.mark.slow
 def test_workers_that_start_at_once_share_the_trials(place):
     workers = [place.begin("--trials", 9, "--workers", 2, STEPS="4") for _ in range(2)]
     outputs = [place.end(worker) for worker in workers]
@@ -341,6 +344,7 @@ def test_a_later_call_with_more_trials_continues(place):
     assert [row["source"] for row in place.rows()] == ["default", "published", "sampled", "sampled"]
 
 
+@pytest.mark.slow
 def test_after_kill_9_another_call_finishes(place):
     worker = place.begin(STEPS="40")
     training = place.wait_for_steps(5)
@@ -356,6 +360,7 @@ def test_after_kill_9_another_call_finishes(place):
     assert len(processes) == 2 and training in processes
 
 
+@pytest.mark.slow
 def test_after_kill_9_another_worker_takes_the_trial(place):
     killed = place.begin("--trials", 2, STEPS="60")
     place.wait_for_steps(5)
@@ -381,6 +386,7 @@ def test_a_trial_waits_for_the_training_that_a_dead_worker_left(place):
     check_books(place, place.rows(), trials=1, steps=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signum, workers", [(signal.SIGTERM, 2), (signal.SIGINT, 1), (signal.SIGHUP, 1)])
 def test_a_signal_puts_the_trials_back(place, signum, workers):
     worker = place.begin("--trials", 2, "--workers", workers, STEPS="100")
@@ -397,6 +403,7 @@ def test_a_signal_puts_the_trials_back(place, signum, workers):
     assert [row["state"] for row in rows].count("put back") == workers
 
 
+@pytest.mark.slow
 def test_what_goes_wrong_is_counted_and_said(place):
     faults = "no episode", "crashes", "crashes once", "not finite", "", "exits"
     faults = {f"trial_{n}": fault for n, fault in enumerate(faults)}
@@ -421,6 +428,7 @@ def test_a_search_in_which_all_fails_says_so(place):
     assert not (place.path / "runs/tune/settings").exists()
 
 
+@pytest.mark.slow
 def test_a_refusal_during_the_search_ends_the_worker(place):
     code, output, errors = place.end(place.begin(FAULTS='{"trial_1": "refused"}'))
     assert (code, errors) == (2, "tune.py: error: the flags are bad\n")
@@ -428,6 +436,7 @@ def test_a_refusal_during_the_search_ends_the_worker(place):
     assert [row["state"] for row in place.rows()] == ["finished", "put back", "finished", "finished"]
 
 
+@pytest.mark.slow
 def test_a_trial_of_another_machine_is_left_alone(place):
     worker = place.begin("--trials", 1, STEPS="100")
     place.wait_for_steps(2)
@@ -465,6 +474,7 @@ BAD = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flags, sentence", BAD, ids=[" ".join(map(str, flags)) for flags, _ in BAD])
 def test_bad_input_is_refused(place, flags, sentence):
     given = ["--algorithm", "ppo", "--env-id", "HalfCheetah-v5", *map(str, flags)]
@@ -474,6 +484,7 @@ def test_bad_input_is_refused(place, flags, sentence):
     assert place.steps() == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "flags, sentence",
     [
@@ -565,6 +576,7 @@ def real(path: Path, *flags) -> subprocess.Popen:
     return subprocess.Popen(command, cwd=path, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
+@pytest.mark.slow
 def test_real_trainings(tmp_path):
     """Episodes have 999 steps: with the 256 steps of 16 environments, as published, none ends."""
     task = "--algorithm ppo --env-id MountainCarContinuous-v0 --trials 2 --workers 2 --steps 7000".split()

@@ -29,6 +29,7 @@ def check_videos(folder: Path, lengths: list[str]):
         assert len(video) in (length, length + 1)
 
 
+@pytest.mark.slow
 @needs_osmesa
 def test_videos_of_mujoco(tmp_path):
     done = run(SCRIPT, *FLAGS, "--run-dir", tmp_path / "run", "--capture-video", MUJOCO_GL="osmesa")
@@ -43,6 +44,7 @@ def test_videos_of_mujoco(tmp_path):
         check_videos(tmp_path / "run" / folder, [length for _, length in plain])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", ["Pendulum-v1", "BipedalWalker-v3"])
 def test_window_and_videos_of_pygame(env_id, tmp_path):
     flags = (*FLAGS, "--env-id", env_id, "--run-dir", tmp_path / "run")
@@ -55,6 +57,7 @@ def test_window_and_videos_of_pygame(env_id, tmp_path):
     check_videos(tmp_path / "run" / "best.videos", ["30", "30"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "env_id, platform",
     [
@@ -72,6 +75,7 @@ def test_what_cannot_be_drawn_is_refused_before_training(env_id, platform, tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_window_of_mujoco_without_a_screen(tmp_path):
     """GLFW ends the whole process there."""
     assert run(SCRIPT, *FLAGS, "--run-dir", tmp_path / "run").returncode == 0
