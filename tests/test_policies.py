@@ -1,5 +1,7 @@
 """The policies that are kept in sweeps/results/policies return what the table of runs says of them."""
 
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -20,13 +22,11 @@ def test_there_are_policies():
 @pytest.mark.parametrize("path", POLICIES, ids=lambda path: path.stem)
 def test_a_kept_policy_returns_what_the_table_says(path):
     """Digit for digit with the table's processor and versions; elsewhere its mean is within the spread of episodes."""
-    runs = (
-        pd.read_csv(RESULTS / "benchmark/runs.csv", dtype=str, keep_default_na=False).set_index("task").loc[[path.stem]]
-    )
-    kept = (runs.method == "RefinePPO") & (runs.depth == "4") & (runs.schedule == "average") & (runs.seed == "1")
-    (row,) = (row for _, row in runs[kept].iterrows())
+    runs = pd.read_csv(RESULTS / "benchmark/runs.csv", dtype=str, keep_default_na=False).set_index("run")
     checkpoint = load_checkpoint(path)
     args = Args(**checkpoint["args"])
+    row = runs.loc[Path(args.run_dir).name]
+    assert (row.task, row.method, row.depth, row.schedule, row.seed) == (path.stem, "RefinePPO", "4", "average", "1")
     assert checkpoint["global_step"] == int(row.best_global_step)
     returns, _ = evaluate(agent_of(checkpoint, args), evaluation_seeds(args, checkpoint["global_step"], final=True))
     machine = describe_machine()
