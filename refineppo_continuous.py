@@ -857,25 +857,29 @@ def make_env(args: Args, render_mode: str | None = None, **facts) -> Task:
 
     `facts` are told where a number is not finite. What MuJoCo says of the model file while it loads is dropped.
     """
-    load_mujoco()
+    mujoco = load_mujoco()
     seen, options = len(mujoco_warnings), {"max_episode_steps": args.max_episode_steps, "disable_env_checker": True}
     if render_mode:  # a task need not know the keyword
         options["render_mode"] = render_mode
     env = ask(gym.make, args.env_id, **options)
     del mujoco_warnings[seen:]
+    renderer = getattr(env.unwrapped, "mujoco_renderer", None)
+    if render_mode and getattr(renderer, "camera_id", None) == -1:  # stays where the robot starts
+        renderer.camera_id = mujoco.mj_name2id(renderer.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")  # or -1 again
     if not isinstance(env.observation_space, gym.spaces.Box) or len(env.observation_space.shape) != 1:
         env = gym.wrappers.FlattenObservation(env)
     return Task(env, facts)
 
 
 def load_mujoco():
-    """Hear MuJoCo's warnings. It loads OpenGL at once, of the kind that MUJOCO_GL names, which may be missing."""
+    """MuJoCo, its warnings heard. It loads OpenGL at once, of the kind that MUJOCO_GL names, which may be missing."""
     try:
         import mujoco
     except Exception as error:  # an ImportError, an AttributeError, a RuntimeError: each kind fails in its own way
         sentence = f"MuJoCo does not start with MUJOCO_GL={os.environ.get('MUJOCO_GL')} on this machine"
         refuse(f"{sentence}: {first_line(error)}; training needs none, {HOW_TO_DRAW}")
     mujoco.set_mju_user_warning(mujoco_warnings.append)
+    return mujoco
 
 
 def episode_seeds(seed: int, *key: int, count: int = 1) -> list[int]:

@@ -5,7 +5,7 @@ from ctypes.util import find_library
 from pathlib import Path
 
 import pytest
-from conftest import ROOT, run
+from conftest import ROOT, python, run
 from test_commands import QUICK, read_json
 
 pytest.importorskip("moviepy")
@@ -42,6 +42,26 @@ def test_videos_of_mujoco(tmp_path):
     assert [f"{value:.3f}" for value in returns] == [value for value, _ in plain]
     for folder in ("videos", "best.videos"):
         check_videos(tmp_path / "run" / folder, [length for _, length in plain])
+
+
+FAR_AWAY = """
+from refineppo_continuous import Args, make_env
+
+task = make_env(Args(env_id="HalfCheetah-v5"), "rgb_array")
+task.reset(seed=0)
+for x in (0.0, 100.0):
+    task.unwrapped.data.qpos[0] = x
+    task.step(task.action_space.low)
+    red, green, blue = task.render().astype(int).T
+    print((red > blue + 40).sum())  # of the robot, which alone is orange
+task.close()
+"""
+
+
+@needs_osmesa
+def test_the_camera_follows_the_robot():
+    done = python("-c", FAR_AWAY, MUJOCO_GL="osmesa")
+    assert all(int(pixels) > 1000 for pixels in done.stdout.split()) and len(done.stdout.split()) == 2, done.stderr
 
 
 @pytest.mark.slow
