@@ -197,7 +197,7 @@ class Estimate(NamedTuple):
 
     def __str__(self) -> str:
         value, low, high = (shown(x, self.value) for x in self)
-        return "-" if math.isnan(self.value) else f"{value} [{low}, {high}]"
+        return value if math.isnan(self.value) or self.low == self.high else f"{value} [{low}, {high}]"
 
 
 class Spread(NamedTuple):

@@ -240,6 +240,7 @@ def test_few_seeds(tmp_path, make_report):
     assert float(rows["Ant-v5"]["p_improvement_value"]) == 0.5
     assert float(rows["Hopper-v5"]["p_improvement_value"]) == pytest.approx(7.5 / 9)
     assert 0 <= float(rows["Hopper-v5"]["p_improvement_low"]) < 7.5 / 9 < float(rows["Hopper-v5"]["p_improvement_high"])
+    assert str(report.Estimate.iqm([np.array([3.0])])) == "3.00"  # no interval of one seed
     best, last, late = read(out / "aggregate.csv")
     assert float(best["p_improvement_value"]) == pytest.approx((7.5 / 9 + 0.5) / 2)
     assert best["tasks"] == last["tasks"] == "2" and late["tasks"] == "1"  # no episode ended in Hopper's last 10 %
