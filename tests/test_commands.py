@@ -136,7 +136,6 @@ def check_checkpoint(path: Path, script, env_id: str, total: int):
 SLOW = [pytest.param(task, 1 + 2 * (i % 2), marks=pytest.mark.slow) for i, task in enumerate(TASKS)]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("env_id, num_envs", [*SLOW, ("probe_envs:Unbounded-v0", 3)])
 def test_every_task_trains_and_leaves_all_files(script, env_id, num_envs, tmp_path):
     """The real command in a folder of its own; of the paper's tasks nothing is to be said."""

@@ -10,6 +10,7 @@ from test_commands import QUICK, read_json
 
 pytest.importorskip("moviepy")
 iio = pytest.importorskip("imageio.v3")
+pytestmark = pytest.mark.slow
 needs_osmesa = pytest.mark.skipif(not find_library("OSMesa"), reason="OSMesa, package libosmesa6, is missing")
 
 SCRIPT = "refineppo_continuous.py"  # the other has the same lines, which a test on their difference holds equal
@@ -29,7 +30,6 @@ def check_videos(folder: Path, lengths: list[str]):
         assert len(video) in (length, length + 1)
 
 
-@pytest.mark.slow
 @needs_osmesa
 def test_videos_of_mujoco(tmp_path):
     done = run(SCRIPT, *FLAGS, "--run-dir", tmp_path / "run", "--capture-video", MUJOCO_GL="osmesa")
@@ -64,7 +64,6 @@ def test_the_camera_follows_the_robot():
     assert all(int(pixels) > 1000 for pixels in done.stdout.split()) and len(done.stdout.split()) == 2, done.stderr
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("env_id", ["Pendulum-v1", "BipedalWalker-v3"])
 def test_window_and_videos_of_pygame(env_id, tmp_path):
     flags = (*FLAGS, "--env-id", env_id, "--run-dir", tmp_path / "run")
@@ -77,7 +76,6 @@ def test_window_and_videos_of_pygame(env_id, tmp_path):
     check_videos(tmp_path / "run" / "best.videos", ["30", "30"])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "env_id, platform",
     [
@@ -95,7 +93,6 @@ def test_what_cannot_be_drawn_is_refused_before_training(env_id, platform, tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
 def test_window_of_mujoco_without_a_screen(tmp_path):
     """GLFW ends the whole process there."""
     assert run(SCRIPT, *FLAGS, "--run-dir", tmp_path / "run").returncode == 0
