@@ -508,7 +508,7 @@ def ppo_loss(params: dict, args: Args, batch: Batch) -> tuple[torch.Tensor, torc
     clipped_ratio = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
     policy_loss = -torch.minimum(advantages * ratio, advantages * clipped_ratio).mean()
 
-    values = network(layers(params, "critic"), batch.obs).squeeze(1)
+    values = network(layers(params, "critic"), batch.obs)[:, 0]  # its gradient is faster than squeeze's
     value_errors = (values - batch.returns) ** 2
     if args.clip_vloss:
         clipped_values = batch.values + (values - batch.values).clamp(-args.clip_coef, args.clip_coef)
@@ -738,6 +738,13 @@ class NotFinite(Exception):
         self.facts = facts
 
 
+class TaskExit(RuntimeError):
+    """A task that ends the program (a missing licence, a closed window) has failed."""
+
+    def __init__(self, stop: SystemExit):
+        super().__init__(f"the task ended the program, with exit code {stop.code}")
+
+
 def check_finite(what: str, numbers: dict):
     """NotFinite, with their names, if any of these numbers and tensors are not."""
     bad = [name for name, x in numbers.items() if not torch.as_tensor(x).isfinite().all()]
@@ -765,12 +772,18 @@ class Task(gym.Wrapper):
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
         self.facts |= {"episode_seed": seed, "episode_step": 0}
         self.unwrapped.action_space.seed(seed)  # some tasks draw from it
-        obs, info = ask(self.env.reset, seed=seed, options=options)
+        try:
+            obs, info = self.env.reset(seed=seed, options=options)
+        except SystemExit as stop:
+            raise TaskExit(stop) from stop
         return self.checked(obs), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         self.facts["episode_step"] += 1
-        obs, reward, terminated, truncated, info = ask(self.env.step, np.array(action, self.action_dtype))
+        try:
+            obs, reward, terminated, truncated, info = self.env.step(np.array(action, self.action_dtype))
+        except SystemExit as stop:
+            raise TaskExit(stop) from stop
         reward = np.asarray(reward, float).item()
         return self.checked(obs, reward), reward, bool(terminated), bool(truncated), info
 
@@ -790,14 +803,6 @@ class Task(gym.Wrapper):
             super().close()
 
 
-def ask(method, *values, **named):
-    """What the task answers; one that ends the program (a missing licence, a closed window) has failed."""
-    try:
-        return method(*values, **named)
-    except SystemExit as stop:
-        raise RuntimeError(f"the task ended the program, with exit code {stop.code}") from stop
-
-
 def make_env(args: Args, render_mode: str | None = None, **facts) -> Task:
     """One environment of the task; observations that are no vector are flattened, as CleanRL does.
 
@@ -807,7 +812,10 @@ def make_env(args: Args, render_mode: str | None = None, **facts) -> Task:
     seen, options = len(mujoco_warnings), {"max_episode_steps": args.max_episode_steps, "disable_env_checker": True}
     if render_mode:  # a task need not know the keyword
         options["render_mode"] = render_mode
-    env = ask(gym.make, args.env_id, **options)
+    try:
+        env = gym.make(args.env_id, **options)
+    except SystemExit as stop:
+        raise TaskExit(stop) from stop
     del mujoco_warnings[seen:]
     renderer = getattr(env.unwrapped, "mujoco_renderer", None)
     if render_mode and getattr(renderer, "camera_id", None) == -1:  # stays where the robot starts
