@@ -13,7 +13,9 @@ import tomllib
 from dataclasses import fields
 from pathlib import Path
 
+import pandas as pd
 import pytest
+import results_page
 from conftest import ROOT, python, run
 from test_commands import QUICK
 
@@ -144,3 +146,16 @@ def test_every_flag_that_is_named_exists():
     known |= {"--max-running", "--time", "--partition"}  # of run_slurm.sh and sbatch
     named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", readme()))
     assert named - known == set() and len(named) > 10
+
+
+def test_the_results_are_those_of_the_data():
+    """The page's tables, one of its cells by hand, and what it and the README say of all tasks together."""
+    page, of_runs = (results_page.RESULTS / "README.md").read_text(), results_page.RESULTS / "benchmark" / "runs.csv"
+    assert results_page.fill(page) == page
+    runs = pd.read_csv(of_runs).query("task == 'Hopper-v5' and steps == 1e6 and actor == '128x128' and method == 'PPO'")
+    runs = runs[runs["flags"] == "--eval-interval 50000"]
+    assert f"| Hopper-v5 | {runs.best_mean.mean():.0f} ± {runs.best_mean.std():.0f} |" in page
+    all_tasks = pd.read_csv(results_page.TABLES / "aggregate.csv").iloc[0]
+    value, low, high = (f"{all_tasks[f'p_improvement_{part}']:.2f}" for part in ("value", "low", "high"))
+    for text in (readme(), page):
+        assert f"{value} of the pairs of seeds (95 % interval {low} to {high}" in " ".join(text.split())
