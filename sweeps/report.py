@@ -363,7 +363,8 @@ def curves_figure(curves: dict[str, list[list[np.ndarray]]]) -> Figure:
                 low, high = band["mean"] - band["std"], band["mean"] + band["std"]
                 axis.fill_between(band.index, low, high, color=look["color"], alpha=0.15, linewidth=0)
                 (handles[method],) = axis.plot(band.index, band["mean"], **look, linewidth=1.6, zorder=3)
-        axis.set(title=task, xlim=(0, None))
+        counts = " / ".join({str(len(seeds)): None for seeds in pair})
+        axis.set(title=f"{task} (seeds: {counts})", xlim=(0, None))
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
         axis.yaxis.set_major_formatter(EngFormatter(sep=""))
         axis.grid(color="0.9", linewidth=0.5)
@@ -666,7 +667,7 @@ def missing(e: Experiment) -> list[str]:
     lines = [f"no finished run of {', '.join(items)}: {tasks}" for tasks, items in some.items()]
     for cell, runs in e.cells.items():
         few[len(runs), cell.method].append(cell.task)
-    return lines + [f"{n} of {SEEDS} seeds of {m}: {', '.join(few[n, m])}" for n, m in sorted(few) if n < SEEDS]
+    return lines + [f"only {n} of {SEEDS} seeds of {m}: {', '.join(few[n, m])}" for n, m in sorted(few) if n < SEEDS]
 
 
 # --- The report -------------------------------------------------------------------------------------------------------
@@ -723,9 +724,7 @@ def check_folder(folder: Path, found: dict[str, Run]):
 def main():
     args = tyro.cli(Args, description=__doc__)
     if args.depth < 1 or not args.sources:
-        refuse(
-            f"--depth must be at least 1, not {args.depth}" if args.sources else "name a folder of runs or a runs.csv"
-        )
+        refuse(f"--depth must be at least 1, not {args.depth}" if args.sources else "name run folders or a runs.csv")
     first, said = args.sources[0], []
     found = merge(run for source in args.sources for run in read_source(source, said.append))
     if not found:

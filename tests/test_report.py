@@ -131,7 +131,7 @@ def test_table_1(tmp_path, make_report):
     assert hopper["improv_percent"] == "50.0" and hopper["paper_ppo_std"] == "826"
     missing = section(text, "What is missing")
     assert "- no finished run of PPO: HalfCheetah-v5, Walker2d-v5, Swimmer-v5, Reacher-v5, " in missing
-    assert "- 1 of 5 seeds of PPO: Ant-v5\n- 2 of 5 seeds of PPO: " in missing
+    assert "- only 1 of 5 seeds of PPO: Ant-v5\n- only 2 of 5 seeds of PPO: " in missing
     note = section(text, "Table 1").replace("\n", " ")
     assert "each method tuned by a search of its own. Here: 6,000,000 steps, not tuned per method" in note
     assert "first rollouts at or past each multiple of `--eval-interval`" in note and "states of 20 episodes" in note
@@ -737,7 +737,7 @@ def test_chosen_curves(tmp_path, make_report, monkeypatch):
 
 BAD_INPUT = {
     "missing": ("nothing", "there is no nothing"),
-    "no source": ("--depth 2", "name a folder of runs or a runs.csv"),
+    "no source": ("--depth 2", "name run folders or a runs.csv"),
     "empty table": ("empty/runs.csv", "has no column run"),
     "another table": ("runs other", "has no column failure"),
     "no runs": ("mine", "there is no finished run in mine"),
