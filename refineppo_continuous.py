@@ -68,7 +68,7 @@ class Args:
     run_dir: str | None = None
     """folder of the run; default runs/{env_id}__{exp_name}__{seed}__{unix time}"""
     resume: bool = False
-    """continue the run in --run-dir where its last checkpoint left it; a finished run is left as it is"""
+    """continue the run in --run-dir where its last checkpoint left it, or begin it; a finished one is left as it is"""
     max_episode_steps: int | None = None
     """time limit of an episode, in steps; default the task's own"""
 
@@ -146,7 +146,7 @@ class Args:
     cuda: bool = False
     """update on the GPU; acting stays on the CPU"""
     num_threads: int = 1
-    """threads of torch; sweeps fill cores with processes instead"""
+    """threads of torch and NumPy; sweeps fill cores with processes instead"""
     progress: bool = True
     """show a progress bar (on a terminal) and a line per evaluation"""
     track: bool = False
@@ -179,7 +179,7 @@ def network(weights: list[tuple], x):
     *hidden, (w_out, b_out) = weights
     for w, b in hidden:
         x = tanh(dot(x, w) + b)
-    return dot(w_out.T, x.T).T + b_out  # = x @ w_out; BLAS is faster with the narrow matrix first
+    return dot(w_out.T, x.T).T + b_out  # = x @ w_out; torch is faster with the narrow matrix first
 
 
 def refinement_coefficients(args: Args) -> list[float]:
@@ -229,7 +229,7 @@ def layers(params: dict, name: str) -> list[tuple]:
 
 
 def in_rows_of_8(function, obs: np.ndarray) -> np.ndarray:
-    """`function` of rows (8, obs_dim), for one observation (obs_dim,) or for any number of them (n, obs_dim).
+    """`function`, (8, obs_dim) to (..., 8, n), of one observation (obs_dim,) or of any number (rows, obs_dim).
 
     How a product of matrices rounds depends on its number of rows. With always eight, an action, and so an episode's
     return, does not depend on how many others are computed beside it.
@@ -341,8 +341,8 @@ class Environments:
     def load(self, state: dict):
         """Bring every environment exactly to where it was, by replaying its running episode; warn if that fails."""
         same = True
-        for i, actions in zip(range(len(self.envs)), state["actions"], strict=True):
-            self.episodes[i] = state["episodes"][i] - 1
+        for i, actions in enumerate(state["actions"]):
+            self.episodes[i] = state["episodes"][i] - 1  # `reset` counts it again
             self.obs[i] = self.reset(i)
             for action in actions.numpy():
                 self.obs[i], _, *ends = self.step_one(i, action)
@@ -415,7 +415,7 @@ class Normalizer:
     def normalize(self, obs: np.ndarray) -> np.ndarray:
         """Raw observations (n, obs_dim), normalised and clipped to +-10 in float32, with the statistics as they are."""
         if self.args.normalize_obs:
-            mean, squares = self.obs.mean[None], self.obs.squares[None]  # rows: see `collect`
+            mean, squares = self.obs.mean[None], self.obs.squares[None]  # rows: faster
             obs = ((obs - mean) / np.sqrt(squares / self.obs.count.item() + 1e-8)).clip(-10.0, 10.0)
         return obs.astype(np.float32)
 
@@ -758,11 +758,18 @@ def mean_and_std(x) -> tuple[float, float]:
 
 
 def evaluate_checkpoint(given: Args):
-    """--evaluate: print a saved policy's returns, which for best.pt and last.pt are those in result.json."""
+    """--evaluate: print a saved policy's returns, which for best.pt and last.pt are those in result.json.
+
+    All flags are the checkpoint's, but for those that say how to evaluate.
+    """
     path = Path(given.evaluate).expanduser()
     checkpoint = load_checkpoint(path)
     own = ("evaluate", "final_eval_episodes", "render", "capture_video", "num_threads", "cuda")
     args = replace(Args(**checkpoint["args"]), **{name: getattr(given, name) for name in own})
+    for name, value in asdict(given).items():
+        if name not in FREE_ON_RESUME and value not in (getattr(args, name), getattr(Args, name)):
+            its_own = f"{flag(name)} is the checkpoint's own, {getattr(args, name)}"
+            refuse(f"{its_own}; beside --evaluate go only {', '.join(map(flag, own[1:]))}")
     check_args(args)
     videos = path.with_suffix(".videos") if args.capture_video else None
     if videos and videos.exists():
@@ -812,7 +819,7 @@ class Task(gym.Wrapper):
 
     Observations become float64 arrays of the space's shape (else ValueError), which the next step may overwrite,
     rewards floats, ends bools; the task gets an action of its own in the space's dtype, which it may change. A number
-    that is not finite raises NotFinite with the episode's seed and the step in it, which replay it, and with `facts`.
+    that is not finite raises NotFinite with the episode's seed and the step in it, where it is met again, and `facts`.
     """
 
     def __init__(self, env: gym.Env, facts: dict):
@@ -916,6 +923,7 @@ EXIT_BAD_ARGUMENTS, EXIT_FAILURE, EXIT_STOPPED = 2, 3, 75
 POSITIVE, FRACTION = ("positive", lambda x: 0 < x < math.inf), ("between 0 and 1", lambda x: 0 <= x <= 1)
 RULES = {"seed": ("from 0 to 2^63 - 1", lambda x: 0 <= x < 2**63), "gamma": FRACTION, "gae_lambda": FRACTION}
 RULES |= dict.fromkeys(("learning_rate", "clip_coef", "max_grad_norm", "target_kl"), POSITIVE)
+RULES["log_std_init"] = "from -20 to 20", lambda x: -20 <= x <= 20
 RULES_BY_TYPE = {int: ("at least 1", lambda x: x >= 1), float: ("a finite number", math.isfinite)}
 
 
@@ -932,6 +940,10 @@ def refuse(sentence: str):
     """End the program with one sentence about its input."""
     print(f"{Path(sys.argv[0]).name}: error: {sentence}", file=sys.stderr)
     raise SystemExit(EXIT_BAD_ARGUMENTS)
+
+
+def flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 def first_line(error: BaseException) -> str:
@@ -968,16 +980,15 @@ def refusing(sentence: str, advice: str = ""):
 
 def check_args(args: Args):
     """Refuse what cannot be trained or evaluated; set the number of threads, which changes the last bits of results."""
-    for flag in fields(args):
-        value, name = getattr(args, flag.name), flag.name.replace("_", "-")
+    for name, value in asdict(args).items():
         for x in value or (0,) if isinstance(value, tuple) else (value,):  # no layers are refused as one of 0 units
-            rule, holds = RULES.get(flag.name) or RULES_BY_TYPE.get(type(x)) or ("", lambda x: True)
+            rule, holds = RULES.get(name) or RULES_BY_TYPE.get(type(x)) or ("", lambda x: True)
             if x is not None and not holds(x):
-                refuse(f"--{name} must be {rule}, not {value}")
+                refuse(f"{flag(name)} must be {rule}, not {value}")
     if args.batch_size % args.num_minibatches:
         steps = f"{args.batch_size} steps ({args.num_envs} environments x {args.num_steps} steps)"
         refuse(f"{args.num_minibatches} minibatches do not divide a rollout of {steps} evenly")
-    if args.batch_size == args.num_minibatches:
+    if args.norm_adv and args.batch_size == args.num_minibatches:
         refuse("a minibatch must have at least 2 steps, to normalise its advantages; use fewer --num-minibatches")
     if args.last_step < 1:
         refuse(f"--total-timesteps {args.total_timesteps} is less than one rollout of {args.batch_size} steps")
@@ -1173,6 +1184,7 @@ def agent_of(checkpoint: dict, args: Args) -> Agent:
 # The run's folder
 
 FREE_ON_RESUME = {"resume", "run_dir", "progress", "track", "capture_video", "checkpoint_interval", "save_every"}
+EVALUATIONS = "global_step,return_mean,return_std,return_min,return_max,length_mean"
 RESUMED = {"adam", "envs", "rng", "progress", "compiled", "machine", "logs"}  # in last.pt alone
 
 
@@ -1203,8 +1215,9 @@ class Run:
         try:
             str(self.dir).encode()
             self.dir.mkdir(parents=True, exist_ok=True)
-            known = (self.dir / ".lock").exists()  # a run of ours was here before
             begun = [path.name for path in self.dir.iterdir() if path.name != ".lock"]
+            table = self.dir / "evaluations.csv"  # .lock and it: a run of ours was here before
+            known = (self.dir / ".lock").exists() or table.is_file() and table.read_text().startswith(EVALUATIONS)
         except UnicodeEncodeError:  # it has bytes that the locale cannot decode
             refuse(f"this locale cannot spell the folder {ascii(str(self.dir))}; PYTHONUTF8=1 helps")
         except OSError as error:
@@ -1238,7 +1251,7 @@ class Run:
             saved, now = load_checkpoint(path), asdict(self.args)
             changed = [name for name in now if name not in FREE_ON_RESUME and now[name] != saved["args"][name]]
             if changed:
-                was = ", ".join(f"--{name.replace('_', '-')} {saved['args'][name]}" for name in changed)
+                was = ", ".join(f"{flag(name)} {saved['args'][name]}" for name in changed)
                 refuse(f"the run in {self.dir} was started with other flags than these: {was}")
         if finished:
             say(f"the run in {self.dir} is finished")
@@ -1266,13 +1279,15 @@ class Run:
 
     def __exit__(self, kind, error, trace):
         """Close everything; where a number was not finite, say which, where and when, and leave what was saved."""
-        self.stack.close()
-        self.tell_wandb("finish", 0 if error is None else 1)
-        if isinstance(error, NotFinite):
-            facts = error.facts | {"global_step": self.progress.global_step, "mujoco_warnings": mujoco_warnings[:5]}
-            write_atomically(self.dir / "failure.json", json.dumps(facts, indent=2).encode())
-            print(f"{SCRIPT}: numerical failure: {facts} (also in {self.dir / 'failure.json'})", file=sys.stderr)
-            raise SystemExit(EXIT_FAILURE)
+        try:
+            self.stack.close()
+        finally:  # where the disk is full, the logs cannot be closed
+            self.tell_wandb("finish", 0 if error is None else 1)
+            if isinstance(error, NotFinite):
+                facts = error.facts | {"global_step": self.progress.global_step, "mujoco_warnings": mujoco_warnings[:5]}
+                write_atomically(self.dir / "failure.json", json.dumps(facts, indent=2).encode())
+                print(f"{SCRIPT}: numerical failure: {facts} (also in {self.dir / 'failure.json'})", file=sys.stderr)
+                raise SystemExit(EXIT_FAILURE)
 
     def begin_or_resume(self) -> Training:
         """The training, as it was when last.pt was saved; and its logs, where what followed it is dropped."""
@@ -1292,8 +1307,8 @@ class Run:
         if not saved:
             self.log_hyperparameters()
         hidden = None if self.args.progress else True  # None: only where there is no terminal
-        self.bar = tqdm(total=self.args.last_step, unit=" steps", unit_scale=True, smoothing=0.05, disable=hidden)
-        self.bar.update(progress.global_step)
+        steps = {"total": self.args.last_step, "initial": progress.global_step, "unit": " steps", "unit_scale": True}
+        self.bar = tqdm(**steps, smoothing=0.05, disable=hidden)
         self.stack.callback(self.bar.close)
         return training
 
@@ -1391,8 +1406,7 @@ class Run:
         return True
 
     def write_evaluations(self):
-        rows = ["global_step,return_mean,return_std,return_min,return_max,length_mean"]
-        rows += [",".join(map(str, row)) for row in self.progress.evaluations]
+        rows = [EVALUATIONS, *(",".join(map(str, row)) for row in self.progress.evaluations)]
         write_atomically(self.dir / "evaluations.csv", "".join(f"{row}\n" for row in rows).encode())
 
     def save(self, name: str, agent: Agent, **more):
@@ -1452,7 +1466,7 @@ stop_signals: list[int] = []
 
 
 def catch_signals():
-    """SIGTERM, Ctrl-C, a closed terminal and Slurm's SIGUSR1 ask a run to save and stop; not under nohup."""
+    """SIGTERM, Ctrl-C, Slurm's SIGUSR1 and, without nohup, a closed terminal ask a run to save and stop."""
     for name in ("SIGTERM", "SIGINT", "SIGUSR1", "SIGHUP"):
         signum = getattr(signal, name, None)  # Windows lacks the last two
         if signum and (name != "SIGHUP" or signal.getsignal(signum) is not signal.SIG_IGN):
@@ -1467,6 +1481,7 @@ def request_stop(signum, _):
 
 
 if __name__ == "__main__":
+    sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))  # may be closed
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(errors="backslashreplace")  # a locale may lack the letters of a path
     try:

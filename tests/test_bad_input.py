@@ -39,6 +39,7 @@ REFUSED = [
     ("--ent-coef nan", "--ent-coef"),
     ("--vf-coef inf", "--vf-coef"),
     ("--log-std-init nan", "--log-std-init"),
+    ("--log-std-init 1000", "--log-std-init must be from -20 to 20"),
     ("--actor-hidden", "--actor-hidden"),
     ("--critic-hidden", "--critic-hidden"),
     ("--actor-hidden 16 0", "--actor-hidden"),
@@ -195,6 +196,13 @@ def test_evaluating_a_checkpoint_of_the_other_script(refuses, script, folder, ca
     call_main(other, *QUICK, "--env-id", "Pendulum-v1", "--run-dir", "run")
     capsys.readouterr()
     assert script.__name__ in refuses("--evaluate", "run/best.pt")
+
+
+@pytest.mark.parametrize("flags", ["--eval-episodes 99", "--max-episode-steps 50", "--seed 9", "--no-normalize-obs"])
+def test_evaluating_with_flags_that_are_the_checkpoints(checkpoint, refuses, flags):
+    """They would change nothing; the sentence says which do."""
+    refused = refuses("--evaluate", checkpoint, *flags.split())
+    assert flags.split()[0].replace("no-", "") in refused and "--final-eval-episodes" in refused
 
 
 # --- Real commands ----------------------------------------------------------------------------------------------------

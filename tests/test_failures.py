@@ -1,6 +1,7 @@
 """Clean stops and clear failures: signals, a full disk, damaged files, bad numbers and crashing simulators."""
 
 import ast
+import errno
 import json
 import os
 import resource
@@ -16,6 +17,7 @@ import pytest
 import torch
 from conftest import ROOT
 from resume_helpers import SCRIPTS, Run, differences, finish, flags, killed_after, outcome, refusal, send
+from test_commands import call_main
 
 
 @pytest.fixture(params=SCRIPTS)
@@ -123,6 +125,14 @@ def test_a_reader_that_leaves_ends_no_training(name, tmp_path):
         shown = subprocess.run(command, shell=True, cwd=ROOT, capture_output=True, text=True)
         assert "evaluation return" in shown.stdout and shown.stdout.count("\n") == 1 and shown.stderr == ""
         assert (tmp_path / str(i) / "result.json").exists()
+
+
+@pytest.mark.slow
+def test_without_any_output(name, tmp_path):
+    """Standard output and error are closed, as a daemon's may be."""
+    words = shlex.join(map(str, flags(tmp_path / "run")))
+    assert subprocess.run(f"{sys.executable} {name} {words} >&- 2>&-", shell=True, cwd=ROOT).returncode == 0
+    assert (tmp_path / "run/result.json").exists()
 
 
 @pytest.mark.slow
@@ -389,6 +399,20 @@ def test_bad_number_in_an_update(script, culprit, tmp_path):
     facts = failure(tmp_path / "run")
     assert facts["global_step"] == 0 and culprit in facts["not_finite"]
     assert not list((tmp_path / "run").glob("*.pt"))
+
+
+def test_bad_number_on_a_full_disk(script, tmp_path, monkeypatch):
+    """Logs that cannot be closed do not hide what failed."""
+
+    def close(self):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    (seed,) = script.episode_seeds(1, 0, 0, 0)
+    monkeypatch.setenv("FAULT", f"{seed} 3 nan-obs")
+    monkeypatch.setattr(script.SummaryWriter, "close", close)
+    with pytest.raises(SystemExit) as stop:
+        call_main(script, *flags(tmp_path / "run", env_id="odd_envs:Faulty-v0"))
+    assert stop.value.code == 3 and failure(tmp_path / "run")["episode_seed"] == seed
 
 
 def test_divergence_after_a_while_keeps_the_last_good_checkpoint(name, tmp_path):

@@ -1,11 +1,14 @@
 """Exact resume: a run killed anywhere and continued leaves the same as one that nothing interrupted."""
 
+import io
 import os
 import random
 import shutil
 import signal
 import time
+from importlib import import_module
 
+import filelock
 import numpy as np
 import pytest
 import torch
@@ -24,6 +27,8 @@ from resume_helpers import (
     refusal,
     send,
 )
+from test_commands import call_main
+from tqdm import tqdm
 
 
 @pytest.fixture(params=SCRIPTS)
@@ -282,6 +287,34 @@ def test_resume_starts_from_the_beginning(name, folder, whole, tmp_path):
         assert (run_dir / "notes.txt").read_text() == "mine"
         found["files"] = found["files"].replace(" notes.txt", "")
     assert differences(outcome(whole(name)), found) == []
+
+
+def test_a_file_system_without_locks(name, whole, tmp_path):
+    """There the lock is a file that goes with its process, and with it what says whose the folder is."""
+
+    def without_flock():
+        filelock.FileLock = filelock.SoftFileLock
+
+    words = flags(tmp_path / "run", "--resume", save_every=192)
+    at = "update_function = run.compile(", 1
+    stopped = Run(name, words, tmp_path / "log", at=at, action=send(signal.SIGTERM), before=without_flock)
+    assert stopped.wait() == 75 and not list((tmp_path / "run").glob("*.pt")), stopped.output()
+    finish(name, words, tmp_path / "log", before=without_flock)
+    assert differences(outcome(whole(name)), outcome(tmp_path / "run")) == []
+
+
+def test_the_progress_bar_of_a_resumed_run(name, killed, monkeypatch):
+    """It begins where the run goes on, so that steps/s and the time left are those of this process."""
+    script, bars, (_, words) = import_module(name.removesuffix(".py")), [], killed
+
+    def bar(**given):
+        bars.append(tqdm(**given | {"disable": False, "file": io.StringIO()}))
+        return bars[0]
+
+    bar.write = tqdm.write
+    monkeypatch.setattr(script, "tqdm", bar)
+    call_main(script, *words)
+    assert (bars[0].initial, bars[0].n, bars[0].total) == (128, 512, 512)
 
 
 def test_finished_run_is_left_as_it_is(name, whole, tmp_path):

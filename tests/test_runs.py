@@ -257,6 +257,7 @@ def test_advantages_need_not_be_normalised(script, tmp_path):
     """In the first minibatch the ratio is 1, and the policy loss minus the mean advantage: 0 once it is normalised."""
     flags = ("--env-id", "probe_envs:Counter-v0", "--num-minibatches", 1)
     on, off = (train(script, tmp_path / flag, *flags, flag) for flag in ("--norm-adv", "--no-norm-adv"))
+    train(script, tmp_path / "minibatches of one step", *flags[:-1], 32, "--no-norm-adv")
     assert abs(values(on, "losses/policy_loss")[0]) < 1e-6
     assert values(off, "losses/policy_loss")[0] < -0.1
 
