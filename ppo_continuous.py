@@ -268,7 +268,7 @@ class Environments:
             if self.envs[i] is not None:
                 self.envs[i].close()
             self.envs[i] = make_env(self.args, env=i)
-        (seed,) = episode_seeds(self.args.seed, 0, i, self.episodes[i])
+        (seed,) = episode_seeds(self.args.seed, TRAINING, i, self.episodes[i])
         self.episodes[i] += 1
         self.actions[i], self.returns[i] = [], 0.0
         return self.envs[i].reset(seed=seed)[0]
@@ -477,10 +477,10 @@ def prepare_batch(agent: Agent, rollout: Rollout) -> tuple[Batch, float]:
     obs = torch.from_numpy(rollout.obs).to(agent.device)
     values = network(weights, obs.flatten(0, 1)).view(obs.shape[:2]).cpu().numpy()
     rewards = agent.normalizer.scale_rewards(rollout.rewards, rollout.terminated)
-    cut = [at for at in rollout.final_obs if not rollout.terminated[at]] if args.bootstrap_truncated else []
-    if cut:
-        final_obs = torch.from_numpy(np.stack([rollout.final_obs[at] for at in cut])).to(agent.device)
-        for at, value in zip(cut, network(weights, final_obs).squeeze(1).tolist()):
+    timeouts = [at for at in rollout.final_obs if not rollout.terminated[at]] if args.bootstrap_truncated else []
+    if timeouts:
+        final_obs = torch.from_numpy(np.stack([rollout.final_obs[at] for at in timeouts])).to(agent.device)
+        for at, value in zip(timeouts, network(weights, final_obs).squeeze(1).tolist()):
             rewards[at] += args.gamma * value
     advantages = gae(rewards, values, rollout.terminated | rollout.truncated, args.gamma, args.gae_lambda)
     returns = advantages + values[:-1]
@@ -600,7 +600,7 @@ class Training:
     """All that training changes, and so what last.pt holds beside the flags and the machine."""
 
     def __init__(self, args: Args):
-        seed_global_rng(*episode_seeds(args.seed, 2, 0))
+        seed_global_rng(*episode_seeds(args.seed, GLOBAL_RNG, 0))
         self.envs = Environments(args)
         self.agent = Agent(self.envs.envs[0].observation_space, self.envs.envs[0].action_space, args)
         self.agent.normalizer.observe(self.envs.obs)
@@ -635,7 +635,7 @@ def main():
         run.exit_if_stopped()
         while progress.global_step < args.last_step:
             start, before = time.time(), progress.global_step
-            seed_global_rng(*episode_seeds(args.seed, 2, before))
+            seed_global_rng(*episode_seeds(args.seed, GLOBAL_RNG, before))
             rollout = collect(agent, envs, args.num_steps, training.rng)
             batch, explained_variance = prepare_batch(agent, rollout)
             learning_rate = args.learning_rate * (1 - before / args.last_step if args.anneal_lr else 1)
@@ -695,7 +695,7 @@ def evaluate(agent: Agent, seeds: list[int], render_mode: str | None = None, vid
 def evaluation_seeds(args: Args, global_step: int, final: bool = False) -> list[int]:
     """Odd seeds for a final evaluation, even ones for those during training, so that no seed serves both."""
     count = args.final_eval_episodes if final else args.eval_episodes
-    return [seed - seed % 2 + int(final) for seed in episode_seeds(args.seed, 1, global_step, count=count)]
+    return [seed - seed % 2 + int(final) for seed in episode_seeds(args.seed, EVALUATION, global_step, count=count)]
 
 
 def mean_and_std(x) -> tuple[float, float]:
@@ -843,10 +843,12 @@ def load_mujoco():
     return mujoco
 
 
-def episode_seeds(seed: int, *key: int, count: int = 1) -> list[int]:
-    """Seeds of 31 bits (some simulators keep theirs in a C int), a stream of its own for every key.
+TRAINING, EVALUATION, GLOBAL_RNG = 0, 1, 2
 
-    (0, env, episode) trains, (1, global_step) evaluates, (2, global_step) is for the global generators.
+
+def episode_seeds(seed: int, *key: int, count: int = 1) -> list[int]:
+    """Seeds of 31 bits (some simulators keep theirs in a C int), a stream of its own for every key: (TRAINING, env,
+    episode), (EVALUATION, global_step) and (GLOBAL_RNG, global_step).
     """
     return (np.random.SeedSequence(seed, spawn_key=key).generate_state(count) >> 1).tolist()
 
@@ -1130,7 +1132,7 @@ def agent_of(checkpoint: dict, args: Args) -> Agent:
 # The run's folder
 
 FREE_ON_RESUME = {"resume", "run_dir", "progress", "track", "capture_video", "checkpoint_interval", "save_every"}
-EVALUATIONS = "global_step,return_mean,return_std,return_min,return_max,length_mean"
+EVALUATION_COLUMNS = "global_step,return_mean,return_std,return_min,return_max,length_mean"
 RESUMED = {"adam", "envs", "rng", "progress", "compiled", "machine", "logs"}  # in last.pt alone
 
 
@@ -1163,7 +1165,9 @@ class Run:
             self.dir.mkdir(parents=True, exist_ok=True)
             begun = [path.name for path in self.dir.iterdir() if path.name != ".lock"]
             table = self.dir / "evaluations.csv"  # .lock and it: a run of ours was here before
-            known = (self.dir / ".lock").exists() or table.is_file() and table.read_text().startswith(EVALUATIONS)
+            known = (
+                (self.dir / ".lock").exists() or table.is_file() and table.read_text().startswith(EVALUATION_COLUMNS)
+            )
         except UnicodeEncodeError:  # it has bytes that the locale cannot decode
             refuse(f"this locale cannot spell the folder {ascii(str(self.dir))}; PYTHONUTF8=1 helps")
         except OSError as error:
@@ -1350,7 +1354,7 @@ class Run:
         return True
 
     def write_evaluations(self):
-        rows = [EVALUATIONS, *(",".join(map(str, row)) for row in self.progress.evaluations)]
+        rows = [EVALUATION_COLUMNS, *(",".join(map(str, row)) for row in self.progress.evaluations)]
         write_atomically(self.dir / "evaluations.csv", "".join(f"{row}\n" for row in rows).encode())
 
     def save(self, name: str, agent: Agent, **more):
