@@ -54,7 +54,7 @@ from refineppo_continuous import Agent, layers, mean_and_std, refuse
 
 FOLDS, MIN_EPISODES, SHUFFLES, STARTS = 5, 20, 50, 8  # of a regression, recorded, of early components, per state
 SHUFFLED_FOLDS = model_selection.KFold(FOLDS, shuffle=True, random_state=0)
-FEEDBACK_EPISODES, TRAINING_EPISODES = 20, 10  # behind each return of `feedback`, and of it in `training`
+FEEDBACK_EPISODES, TRAINING_EPISODES = 100, 10  # behind each return of `feedback`, and of it in `training`
 FIT_STATES, TOLERANCES = 20_000, 8  # to which the network of one pass is fitted; that `adaptive` tries
 
 Section = Literal["settling", "r2", "feedback", "anytime", "adaptive", "dynamics", "training"]
@@ -350,7 +350,8 @@ def r2_rows(proposals: np.ndarray, names: list[str]) -> Iterator[tuple[dict, np.
 
 def r2_tables(proposals: np.ndarray, names: list[str], obs: np.ndarray, episodes: np.ndarray, seed: int):
     """delta R^2; and beside it the middle 95 % of what early components shuffled across states give, folds of whole
-    episodes (states of one episode resemble each other), and the observation as a feature of both models."""
+    episodes (states of one episode resemble each other), and the observation as a feature of both models (none, where
+    that alone makes the prediction worse)."""
     tables, rng = {"delta_r2": [], "delta_r2_checks": []}, np.random.default_rng(seed)
     whole = {"folds": model_selection.GroupKFold(FOLDS), "groups": episodes}
     for row, own, both, target in progress(r2_rows(proposals, names), desc="shuffled R^2"):
@@ -361,7 +362,9 @@ def r2_tables(proposals: np.ndarray, names: list[str], obs: np.ndarray, episodes
         check |= {"shuffled_low": low, "shuffled_high": high, "above_shuffled": int(row["delta_r2"] > high)}
         check["by_episode"] = ridge_r2(both, target, **whole) - ridge_r2(own, target, **whole)
         given = np.hstack([own, obs])
-        check["given_observation"] = ridge_r2(np.hstack([given, both[:, 1:]]), target) - ridge_r2(given, target)
+        r2_given = ridge_r2(given, target)
+        gain = ridge_r2(np.hstack([given, both[:, 1:]]), target) - r2_given
+        check["given_observation"] = gain if r2_given > row["r2_baseline"] else np.nan  # its own fit is unstable
         tables["delta_r2"].append(row)
         tables["delta_r2_checks"].append(check)
     return tables
@@ -378,7 +381,7 @@ def feedback_rows(policy: Policy, obs: np.ndarray, proposals: np.ndarray, args: 
         one_pass       no f: a network s -> 128 tanh -> 128 tanh -> action, fitted to m_K(s) in 20,000 states of other
                        episodes of the policy
 
-    return: of 20 episodes, the same ones for every row; lost: the own return minus this one, paired by episode; r2: R^2
+    return: of 100 episodes, the same for every row; lost: the own return minus this one, paired by episode; r2: R^2
     with which the row's m_K reproduces the own one in the recorded states, mean over action components.
     """
     pool, rng, own = proposals.astype(np.float32), np.random.default_rng(args.seed), policy.mean()
@@ -399,7 +402,7 @@ def feedback_rows(policy: Policy, obs: np.ndarray, proposals: np.ndarray, args: 
         own_returns = returns if mean is own else own_returns
         lost, std = mean_and_std(own_returns - returns)
         columns |= {"lost_mean": lost, "lost_std": std, "r2": metrics.r2_score(own(obs), mean(obs))}
-        rows.append({"reads": reads} | columns)
+        rows.append({"reads": reads, "episodes": FEEDBACK_EPISODES} | columns)
     return rows
 
 

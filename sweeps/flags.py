@@ -45,7 +45,7 @@ def words(flags: dict) -> list[str]:
             words.append(f"--{name}" if value else f"--no-{name}")
         else:
             values = value if isinstance(value, tuple) else [value]
-            words += [f"--{name}", *(str(value).removesuffix(".0") for value in values)]
+            words += [f"--{name}", *(str(x).removesuffix(".0") if isinstance(x, float) else str(x) for x in values)]
     return words
 
 

@@ -99,7 +99,8 @@ def attempt(line: str, log: Path) -> int:
     if code == EXIT_BAD_ARGUMENTS and b"another process is at work" in log.read_bytes()[before:]:
         code = EXIT_STOPPED
     joblog = log.with_name("joblog.tsv")
-    with suppress(FileExistsError), open(joblog, "x") as file:
+    beginning = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND  # another job's row may be there before the header
+    with suppress(FileExistsError), open(os.open(joblog, beginning), "w") as file:
         file.write("started\tseconds\texit\thost\tcommand\n")
     at = datetime.fromtimestamp(begun).isoformat(" ", "seconds")
     append(joblog, f"{at}\t{time.time() - begun:.1f}\t{code}\t{socket.gethostname()}\t{line}")
@@ -140,10 +141,12 @@ def one(line: str):
     if (folder / "stop").exists():
         signals.append(signal.SIGTERM)
     begun, finished_before = time.time(), run_folder(line) and not lacks_result(line)
+    continued = not finished_before and run_folder(line) and Path(run_folder(line)).exists()
     code, log = run(line)
     seconds = time.time() - begun
     word, why = outcome(line, code)
-    about = {"line": line, "log": str(log), "outcome": word, "why": why, "seconds": 0 if finished_before else seconds}
+    about = {"line": line, "log": str(log), "outcome": word, "why": why}
+    about |= {"seconds": 0 if finished_before or continued else seconds}  # of all its steps
     append(folder / "outcomes", json.dumps(about))
     running.unlink()
     if signals and code == EXIT_STOPPED:
@@ -188,11 +191,12 @@ def time_left(folder: Path) -> float | None:
     if not trained:
         return None
     per_step = sum(row["seconds"] for row in trained) / sum(steps(row["line"]) for row in trained)
-    seconds = per_step * sum(steps(line) for line in jobs(folder) if line not in ended)
+    left = [line for line in jobs(folder) if line not in ended]
+    seconds = per_step * sum(map(steps, left))
     for running in (folder / "running").iterdir():
         with suppress(FileNotFoundError):  # it has just ended
             seconds -= time.time() - running.stat().st_mtime
-    return max(0, seconds) / int(os.environ["SWEEP_JOBS"])
+    return max(0, seconds) / max(1, min(int(os.environ["SWEEP_JOBS"]), len(left)))
 
 
 def summary(folder: Path):

@@ -81,7 +81,7 @@ class Args:
 
 
 class Experiment:
-    """The finished runs of one number of steps by cell, each seed once, and what they are held against."""
+    """The runs of one number of steps: finished ones by cell, each seed once, and what they are held against."""
 
     def __init__(self, runs: pd.DataFrame, evaluations: pd.DataFrame, args: Args):
         self.args, self.steps = args, int(runs.steps.iloc[0])
@@ -93,7 +93,7 @@ class Experiment:
         self.paper = {(row.task, row.method, row.schedule): row for row in paper.itertuples()}
         self.bounds = pd.read_csv(HERE / "bounds.csv", index_col="task")
         self.paper_tasks = list(dict.fromkeys(paper.task))
-        self.tasks = list(dict.fromkeys([*paper.task, *sorted({*runs.task} - {TOY})]))
+        self.tasks = list(dict.fromkeys([*paper.task, *sorted({cell.task for cell in self.cells} - {TOY})]))
         self.pairs = {task: (Cell(task), self.refineppo(task)) for task in self.tasks}
 
     def refineppo(self, task: str) -> Cell:
@@ -363,8 +363,7 @@ def curves_figure(curves: dict[str, list[list[np.ndarray]]]) -> Figure:
                 low, high = band["mean"] - band["std"], band["mean"] + band["std"]
                 axis.fill_between(band.index, low, high, color=look["color"], alpha=0.15, linewidth=0)
                 (handles[method],) = axis.plot(band.index, band["mean"], **look, linewidth=1.6, zorder=3)
-        counts = " / ".join({str(len(seeds)): None for seeds in pair})
-        axis.set(title=f"{task} (seeds: {counts})", xlim=(0, None))
+        axis.set(title=f"{task}, n = {' / '.join({str(len(seeds)): 0 for seeds in pair})}", xlim=(0, None))
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
         axis.yaxis.set_major_formatter(EngFormatter(sep=""))
         axis.grid(color="0.9", linewidth=0.5)
@@ -667,6 +666,8 @@ def missing(e: Experiment) -> list[str]:
     lines = [f"no finished run of {', '.join(items)}: {tasks}" for tasks, items in some.items()]
     for cell, runs in e.cells.items():
         few[len(runs), cell.method].append(cell.task)
+        if silent := len(runs) - len(e.scores(cell, "train_return_last10pct")):
+            lines.append(f"no episode ended in the last 10 % of {silent} seeds of {cell.method}: {cell.task}")
     return lines + [f"only {n} of {SEEDS} seeds of {m}: {', '.join(few[n, m])}" for n, m in sorted(few) if n < SEEDS]
 
 
@@ -679,7 +680,7 @@ def make_report(runs: pd.DataFrame, evaluations: pd.DataFrame, args: Args) -> di
     sections = settings, baseline, training_curves, sample_efficiency, table_2, depth_figure, few_seeds, controls
     with rc_context(STYLE):
         for steps in sorted({*finished.steps}, key=lambda steps: (-(finished.steps == steps).sum(), steps)):
-            e, report = Experiment(finished[finished.steps == steps], evaluations, args), Report(steps_text(steps))
+            e, report = Experiment(runs[runs.steps == steps], evaluations, args), Report(steps_text(steps))
             action_dimension(report, table_1(e, report))
             for section in (*sections, learning_rates, variants, toy, cost):
                 section(e, report)

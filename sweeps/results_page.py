@@ -34,7 +34,7 @@ def feedback() -> list[list[str]]:
     for path in sorted(RESULTS.glob("analysis/*/feedback.csv")):
         reads = {row.pop("reads"): row for row in pd.read_csv(path).to_dict("records")}
         lost = [reads[x] for x in ("zero", "another_state", "one_pass")]
-        lost = [str(Spread(x["lost_mean"], x["lost_std"] / 20**0.5)) for x in lost]  # of 20 episodes
+        lost = [str(Spread(x["lost_mean"], x["lost_std"] / x["episodes"] ** 0.5)) for x in lost]
         rows.append([path.parent.name, shown(reads["own"]["return_mean"]), *lost, f"{reads['one_pass']['r2']:.3f}"])
     return rows
 

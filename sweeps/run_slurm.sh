@@ -51,7 +51,8 @@ list=$(awk -v most="$steps_per_task" '
 [ "$list" ] || refuse "no jobs"
 tasks=$(tail -n 1 <<<"$list" | cut -f 1)
 path=$RUNS_DIR/slurm/$(date +%Y%m%d-%H%M%S)-$$.tsv
-printf -v command 'exec python %q task %q' "$here/jobs.py" "$path"
+quoted() { printf "'%s'" "${1//\'/\'\\\'\'}"; } # not by %q: sbatch's shell need not know $'...'
+command="exec python $(quoted "$here/jobs.py") task $(quoted "$path")"
 submit=(sbatch --parsable --job-name=refineppo "--array=1-$tasks${max_running:+%$max_running}" --requeue
     --signal=B:USR1@300 --open-mode=append "--output=$RUNS_DIR/slurm/%A_%a.log" --cpus-per-task=1 --mem=2G
     "$@" "--wrap=$command") # exec: the signal must reach jobs.py, not a shell around it

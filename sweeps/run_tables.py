@@ -106,7 +106,7 @@ def find_runs(root: Path, say: Callable) -> list[Path]:
     """Folders of finished and failed runs at and below `root`, through links; says what else is left out."""
     found, unfinished, seen = [], [], set()
     for path, subfolders, files in os.walk(root, followlinks=True, onerror=lambda e: say(f"cannot read {e}")):
-        if os.path.realpath(path) in seen or "runs.csv" in files:  # a loop of links; a report
+        if os.path.realpath(path) in seen or "runs.csv" in files and Path(path) != root:  # a loop of links; a report
             subfolders.clear()
         elif {"trials.csv", "journal.log"} & {*files}:
             say(f"left out: {path}, a search by tune.py")
@@ -122,13 +122,13 @@ def find_runs(root: Path, say: Callable) -> list[Path]:
 
 
 def read_source(source: Path, say: Callable) -> Iterator[Run]:
-    """The runs of a source: of its tables, or of the run folders in it."""
+    """The runs of a source: of its tables, and of the run folders in it."""
     path = source if source.is_file() else source / "runs.csv"
     if not source.exists():
         refuse(f"there is no {source}")
     if path.is_file():
         yield from read_tables(path)
-    elif folders := find_runs(source, say):
+    if source.is_dir() and (folders := find_runs(source, say)):
         defaults = json.loads(json.dumps(asdict(default_args("refineppo"))))  # PPO's are among them
         for folder in folders:
             try:
@@ -237,7 +237,8 @@ def actor_cost(run, obs_dim: int, action_dim: int) -> dict[str, int]:
 def sort_into_cells(runs: pd.DataFrame) -> tuple[dict[Cell, list], dict[tuple[str, str], frozenset[str]], list[str]]:
     """Finished runs of one number of steps as {cell: rows, a seed each}; {(task, method): settings}; seeds again.
 
-    The settings of a task and method are what most of its runs have, and if several are as many, the fewest flags.
+    The settings of a task and method are what most of its runs have, failed ones too, and if several are as many, the
+    fewest flags.
     """
     settings, counts = [*map(settings_of, runs.itertuples())], defaultdict(Counter)
     for run, of_run in zip(runs.itertuples(), settings):
@@ -245,6 +246,8 @@ def sort_into_cells(runs: pd.DataFrame) -> tuple[dict[Cell, list], dict[tuple[st
     base = {key: min(of, key=lambda x: (-of[x], len(x), sorted(x))) for key, of in counts.items()}
     cells, again = defaultdict(dict), []
     for run, of_run in zip(runs.itertuples(), settings):
+        if run.failure:
+            continue
         refinement = (None, None) if run.method == "PPO" else (int(run.depth), run.schedule)
         cell = Cell(run.task, *refinement, difference(of_run, base[run.task, run.method]))
         first = cells[cell].setdefault(run.seed, run)

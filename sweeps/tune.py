@@ -23,9 +23,9 @@ RefinePPO's depth and schedule are searched within the same number of trials, or
 """
 
 import json
-import multiprocessing
 import os
 import random
+import re
 import shlex
 import signal
 import socket
@@ -35,6 +35,7 @@ import warnings
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
+from multiprocessing import get_context
 from pathlib import Path
 from statistics import mean
 from tempfile import TemporaryDirectory
@@ -114,8 +115,7 @@ def number(attempt: FrozenTrial) -> int | None:
 
 def counts(attempt: FrozenTrial) -> bool:
     """Finished, or failed for a reason of its own and not of its worker's."""
-    failed = attempt.state == TrialState.FAIL and "reason" in attempt.user_attrs
-    return attempt.state == TrialState.COMPLETE or failed
+    return attempt.state == TrialState.COMPLETE or attempt.state == TrialState.FAIL and "reason" in attempt.user_attrs
 
 
 def ended(attempts: list[FrozenTrial]) -> dict[int, FrozenTrial]:
@@ -169,10 +169,8 @@ class Worker:
         self.signals, self.child, self.helpers, self.refusal = [], None, [], None
         self.seeds = range(FIRST_SEED, FIRST_SEED + args.seeds)
         self.measure = f"last 10 % of {args.steps} steps, seeds {' '.join(map(str, self.seeds))}"
-        self.fixed, arm = {}, ""
-        if args.refinement_depth:
-            self.fixed = {name: getattr(args, name) for name in REFINEMENT}
-            arm = f"-K{args.refinement_depth}-{args.refinement_schedule}"
+        self.fixed = {name: getattr(args, name) for name in REFINEMENT} if args.refinement_depth else {}
+        arm = f"-K{args.refinement_depth}-{args.refinement_schedule}" if self.fixed else ""
         self.default = default_args(args.algorithm)
         searched = args.algorithm == "refineppo" and not self.fixed
         self.space = SPACE | (REFINEMENT if searched else {})
@@ -297,8 +295,7 @@ class Worker:
             self.child = start([sys.executable, script, *flags], file)
             if self.signals:  # one came before `child` was known
                 self.child.terminate()
-            code = self.child.wait()
-        return code, log.read_bytes()[begun:].decode(errors="replace").strip()
+            return self.child.wait(), log.read_bytes()[begun:].decode(errors="replace").strip()
 
     def train(self, settings: dict, folder: Path, seed: int) -> float:
         """The training return of one seed in the last 10 % of its steps."""
@@ -333,8 +330,7 @@ class Worker:
         seed = random.Random(f"{self.args.sampler_seed} {n}").getrandbits(32)
         self.study.sampler = optuna.samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True)
         point, first = suggest(trial, self.space), self.first
-        sampled = "sampled", to_flags(point, first[0][1]) | self.fixed
-        source, flags = first[n] if n < len(first) else sampled
+        source, flags = first[n] if n < len(first) else ("sampled", to_flags(point, first[0][1]) | self.fixed)
         trial.set_user_attr("source", source)
         trial.set_user_attr("flags", flags)
         return flags
@@ -349,8 +345,7 @@ class Worker:
         folder = self.folder / f"trial_{n}"
         self.lock = take_lock(folder)
         trial.set_user_attr("worker", self.id)
-        flags = self.choose(trial, n)
-        begun, returns = time.time(), []
+        flags, begun, returns = self.choose(trial, n), time.time(), []
         for seed in self.seeds:
             try:
                 returns.append(self.train(flags, folder, seed))
@@ -452,7 +447,7 @@ class Worker:
         return [attempt for n, attempt in sorted(ended(attempts).items()) if n < len(self.first)]
 
     def write_files(self, attempts: list[FrozenTrial]):
-        """The table of all trials, and the best so far as a settings file."""
+        """The table of all trials, and the best so far as a settings file, without what may hold a password."""
         rows = []
         for attempt in (a for a in attempts if number(a) is not None and a.state != TrialState.WAITING):
             about = attempt.user_attrs
@@ -467,10 +462,11 @@ class Worker:
             changed = {name: x for name, x in flags if name in REFINEMENT or x != getattr(self.default, name)}
             others = "; ".join(f"{a.user_attrs['source']} {result(a)}" for a in self.first_ended(attempts))
             which = f"trial {number(leader)} ({leader.user_attrs['source']}), the best of {len(ended(attempts))}"
+            command = re.sub(r" --storage[= ]\S+", "", shlex.join(["python", "sweeps/tune.py", *sys.argv[1:]]))
             lines = [
                 f"# From {which}: mean training return {leader.value:.2f}",
                 f"# in the {self.measure} ({others}).",
-                f"#     {shlex.join(['python', 'sweeps/tune.py', *sys.argv[1:]])}",
+                f"#     {command}",
                 *(" ".join(words({name: x})) for name, x in changed.items()),
             ]
             write_atomically(self.winner_file, "".join(f"{line}\n" for line in lines))
@@ -488,7 +484,8 @@ class Worker:
         print(f"{which} is best with {leader.value:.2f}: {self.winner_file}; all trials are in {table}")
         if len(ended(attempts)) > len(self.first):
             print("the best of many looks better than it is on these seeds: report it with the seeds 1 to 5")
-        print(f"    SETTINGS={shlex.quote(str(self.winners))} sweeps/benchmark.sh {shlex.quote(self.args.env_id)}")
+        command = f"SETTINGS={shlex.quote(str(self.winners))} sweeps/benchmark.sh {shlex.quote(self.args.env_id)}"
+        print(f"    FLAGS={shlex.quote(self.args.flags)} {command}" if self.args.flags else f"    {command}")
 
 
 # --- The program ------------------------------------------------------------------------------------------------------
@@ -500,7 +497,8 @@ def prepare(args: Args) -> Worker:
     warnings.simplefilter("ignore", ExperimentalWarning)
     worker = Worker(args)
     for signum in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1):
-        signal.signal(signum, worker.on_signal)
+        if signal.getsignal(signum) is not signal.SIG_IGN:  # as under nohup
+            signal.signal(signum, worker.on_signal)
     return worker
 
 
@@ -533,10 +531,12 @@ def main(args: Args):
     done = len(ended(worker.open_study()))
     if done < args.trials:
         worker.state_budget(done)
-        spawn = multiprocessing.get_context("spawn")  # a fork would share the database's connections
-        worker.helpers = [spawn.Process(target=help_out, args=(args,)) for _ in range(args.workers - 1)]
-        for helper in worker.helpers:
+        for _ in range(0 if worker.signals else args.workers - 1):
+            helper = get_context("spawn").Process(target=help_out, args=(args,))  # a fork would share the connections
             helper.start()
+            worker.helpers.append(helper)
+        for helper in worker.helpers if worker.signals else ():  # it came while they began
+            helper.terminate()
         worker.work()
         for helper in worker.helpers:
             helper.join()

@@ -75,7 +75,8 @@ def make_report(monkeypatch):
             patch.setattr(report.Report, "figure", lambda self, name, _: self.blocks.update({f"{name}_figure": name}))
             patch.setattr(sys, "argv", ["report.py", *map(str, flags)])
             report.main()
-        out = Path(flags[flags.index("--out-dir") + 1]) if "--out-dir" in flags else flags[0] / "report"
+        own = flags[0] if (flags[0] / "runs.csv").exists() else flags[0] / "report"
+        out = Path(flags[flags.index("--out-dir") + 1]) if "--out-dir" in flags else own
         return (out / "report.md").read_text()
 
     return call
@@ -248,6 +249,7 @@ def test_few_seeds(tmp_path, make_report):
     row = read(out / "selection.csv")[1]
     assert (row["task"], row["ppo_best_mean"], row["ppo_last_mean"]) == ("Hopper-v5", "2000.0", "1999.0")
     assert row["ppo_last_10_percent_mean"] == "5.0" and row["refineppo_last_10_percent_mean"] == ""
+    assert "no episode ended in the last 10 % of 3 seeds of RefinePPO K=4 average: Hopper-v5" in text
     assert "2/252 = 0.0079" in text and "Left out, without bounds: Other-v0." in text
     assert 2 / len([*itertools.combinations(range(10), 5)]) == pytest.approx(0.0079, abs=5e-5)
 
@@ -517,6 +519,24 @@ def test_the_fewest_flags_are_the_settings_where_counts_are_equal(tmp_path, make
     assert table(text, "Table 1")["Hopper-v5"][1] == "1.50 ± 0.71" and "PPO gamma 0.9 - PPO" in text
 
 
+def test_a_failed_run_counts_for_the_settings(tmp_path, make_report):
+    """Of two PPO runs one has failed; two of another actor do not become PPO."""
+    make_seeds(tmp_path, "Hopper-v5", [10])
+    make_run(tmp_path, "failed", "Hopper-v5", 2, failure={"what": "a loss"})
+    make_seeds(tmp_path, "Hopper-v5", [1, 2], prefix="w", actor_hidden=[256, 256])
+    text = make_report(tmp_path)
+    assert table(text, "Table 1")["Hopper-v5"][1] == "10.0" and "PPO 256x256" in text
+
+
+def test_new_runs_beside_the_tables_are_read(tmp_path, make_report):
+    """A report may lie in the folder of its runs, which go on."""
+    make_seeds(tmp_path, "Hopper-v5", [10, 20])
+    make_report(tmp_path, "--out-dir", tmp_path)
+    make_run(tmp_path, "third", "Hopper-v5", 3, 30)
+    make_report(tmp_path)
+    assert len(read(tmp_path / "runs.csv")) == 3
+
+
 def test_a_seed_counts_once(tmp_path, make_report):
     """The first by name; another folder with the same seed of the same cell is named."""
     make_seeds(tmp_path, "Hopper-v5", [10, 20])
@@ -618,6 +638,16 @@ def test_the_mean_curve_is_of_the_seeds_that_were_evaluated_there():
     band = report.mean_curve(curves)
     assert band.index.tolist() == [1, 2, 3] and band["mean"].tolist() == [20, 30, 70]
     assert band["std"].tolist() == pytest.approx([stdev([10, 30]), stdev([20, 40]), 0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seeds, said", [(2, 0.50), (3, 0.75), (5, 0.90)])
+def test_how_often_an_interval_holds_the_truth(seeds, said, monkeypatch):
+    """The report says so of one task's returns, where they are normal."""
+    monkeypatch.setattr(report, "RESAMPLES", 500)
+    samples = np.random.default_rng(0).standard_normal((600, seeds))
+    held = [low <= 0 <= high for _, low, high in (report.Estimate.iqm([sample]) for sample in samples)]
+    assert np.mean(held) == pytest.approx(said, abs=0.06)
 
 
 def test_resampling_stays_within_a_task(strata):

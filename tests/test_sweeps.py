@@ -353,6 +353,9 @@ def test_what_is_left_is_told_by_the_steps(tmp_path, monkeypatch):
     (tmp_path / "outcomes").write_text("\n".join(ended))
     monkeypatch.setenv("SWEEP_JOBS", "2")
     assert jobs.time_left(tmp_path) == pytest.approx(2 * 5000 / 1000 / 2)
+    monkeypatch.setenv("SWEEP_JOBS", "16")  # more than are left
+    assert jobs.time_left(tmp_path) == pytest.approx(2 * 5000 / 1000 / 2)
+    monkeypatch.setenv("SWEEP_JOBS", "2")
     (tmp_path / "running" / "1").touch()
     os.utime(tmp_path / "running" / "1", (time.time() - 4,) * 2)
     assert jobs.time_left(tmp_path) == pytest.approx((10 - 4) / 2, abs=0.5)

@@ -404,6 +404,38 @@ def test_a_signal_puts_the_trials_back(place, signum, workers):
 
 
 @pytest.mark.slow
+def test_a_signal_while_the_budget_is_stated(place):
+    """No further worker begins."""
+    worker = place.begin("--trials", 2, "--workers", 2, STEPS="100")
+    children = Path(f"/proc/{worker.pid}/task/{worker.pid}/children")
+    while not children.read_text():
+        time.sleep(0.02)
+    worker.send_signal(signal.SIGINT)
+    code, output, errors = place.end(worker)
+    assert (code, errors) == (75, "") and "stopped by SIGINT" in output and place.steps() == {}
+
+
+@pytest.mark.slow
+def test_a_closed_terminal_under_nohup_stops_no_search(place):
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a child begins so, too
+    try:
+        worker = place.begin("--trials", 1, STEPS="20")
+    finally:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    place.wait_for_steps(2)
+    worker.send_signal(signal.SIGHUP)
+    assert place.end(worker)[0] == 0
+
+
+def test_the_command_for_the_winner(place):
+    """It has the search's --flags; a password of the database goes into no file."""
+    storage = f"sqlite:///{place.path}/study.db?timeout=20"
+    output = place.tune("--trials", 1, "--flags=--num-threads 1", "", "--storage", storage)
+    assert "    FLAGS='--num-threads 1' SETTINGS=runs/tune/settings sweeps/benchmark.sh HalfCheetah-v5" in output
+    assert "sqlite" not in (place.path / "runs/tune/settings/ppo/HalfCheetah-v5.args").read_text()
+
+
+@pytest.mark.slow
 def test_what_goes_wrong_is_counted_and_said(place):
     faults = "no episode", "crashes", "crashes once", "not finite", "", "exits"
     faults = {f"trial_{n}": fault for n, fault in enumerate(faults)}
