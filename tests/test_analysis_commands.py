@@ -23,7 +23,7 @@ COLUMNS = {
     "delta_r2": "component,step_from,step_to,r2_baseline,r2_augmented,delta_r2",
     "delta_r2_checks": "component,step_from,step_to,delta_r2,shuffled_low,shuffled_high,above_shuffled,by_episode,"
     "given_observation",
-    "feedback": "reads,return_mean,return_std,length_mean,lost_mean,lost_std,r2",
+    "feedback": "reads,episodes,return_mean,return_std,length_mean,lost_mean,lost_std,r2",
     "anytime": "steps,return_mean,return_std,length_mean",
     "anytime_scaled": "steps,return_mean,return_std,length_mean",
     "adaptive": "quantile,tolerance,steps_mean,return_mean,return_std,length_mean",

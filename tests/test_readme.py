@@ -56,7 +56,8 @@ def output(*words, folder: Path) -> str:
 
 def train_or_evaluate(name: str, *flags, folder: Path, **env):
     """Run the command line as it stands, and flags that make it short: of a flag given twice the last one counts."""
-    done = run(name, *flags, *QUICK, cwd=folder, **env)
+    short = ("--final-eval-episodes", 1) if "--evaluate" in flags else QUICK
+    done = run(name, *flags, *short, cwd=folder, **env)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "return" in done.stdout or "is finished" in done.stdout
 

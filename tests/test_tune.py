@@ -430,8 +430,8 @@ def test_a_closed_terminal_under_nohup_stops_no_search(place):
 def test_the_command_for_the_winner(place):
     """It has the search's --flags; a password of the database goes into no file."""
     storage = f"sqlite:///{place.path}/study.db?timeout=20"
-    output = place.tune("--trials", 1, "--flags=--num-threads 1", "", "--storage", storage)
-    assert "    FLAGS='--num-threads 1' SETTINGS=runs/tune/settings sweeps/benchmark.sh HalfCheetah-v5" in output
+    output = place.tune("--trials", 1, "--flags", " --eval-episodes 2", "--storage", storage)
+    assert "    FLAGS=' --eval-episodes 2' SETTINGS=runs/tune/settings sweeps/benchmark.sh HalfCheetah-v5" in output
     assert "sqlite" not in (place.path / "runs/tune/settings/ppo/HalfCheetah-v5.args").read_text()
 
 
