@@ -745,7 +745,8 @@ class Figures:
         chosen = table["quantity"].isin(BY_SEED) & ((table["step"] == 1) | (table["quantity"] != "settling_error"))
         rows = pd.concat([*curves, table[chosen].replace({"quantity": BY_SEED})])
         rows = rows.groupby(["quantity", "seed", "global_step"], sort=False)["value"].mean().reset_index()
-        rows = rows.rename(columns={"global_step": "x", "value": "y"}).assign(line="seed " + rows["seed"].astype(str))
+        rows = rows.rename(columns={"global_step": "x", "value": "y"}).sort_values(["seed", "x"], kind="stable")
+        rows["line"] = "seed " + rows["seed"].astype(str)
         panels = dict(list(rows.groupby("quantity", sort=False)))
         by_seed, _ = self.lines(f"{what}, a line per seed", panels, 3, 2.4, 1.5, xlabel="training step")
         return {"training": by_step, "training_by_seed": by_seed}

@@ -611,9 +611,10 @@ def test_adaptive_draws_points_only():
 
 
 def test_training_draws_a_line_per_seed_beside_the_learning_curve(tmp_path):
-    """Mean over k of the spectral radius and of delta R^2, e_1 alone, the return lost, and evaluations.csv."""
+    """Mean over k of the spectral radius and of delta R^2, e_1 alone, the return lost, and evaluations.csv; by step,
+    also where the checkpoints come as a shell sorts their names."""
     policies, rows = [], []
-    for i, (seed, step) in enumerate(((1, 100), (1, 200), (2, 100), (2, 200))):
+    for i, (seed, step) in enumerate(((1, 100), (1, 200), (2, 200), (2, 100))):
         policy = random_policy(seed=seed)
         policy.path, policy.global_step = tmp_path / str(seed) / f"step_{step}.pt", step
         policy.path.parent.mkdir(exist_ok=True)
