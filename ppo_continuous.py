@@ -380,7 +380,7 @@ class Normalizer:
     def normalize(self, obs: np.ndarray) -> np.ndarray:
         """Raw observations (n, obs_dim), normalised and clipped to +-10 in float32, with the statistics as they are."""
         if self.args.normalize_obs:
-            mean, squares = self.obs.mean[None], self.obs.squares[None]  # rows: faster
+            mean, squares = self.obs.mean[None], self.obs.squares[None]  # as rows: NumPy is faster
             obs = ((obs - mean) / np.sqrt(squares / self.obs.count.item() + 1e-8)).clip(-10.0, 10.0)
         return obs.astype(np.float32)
 
@@ -1164,10 +1164,9 @@ class Run:
             str(self.dir).encode()
             self.dir.mkdir(parents=True, exist_ok=True)
             begun = [path.name for path in self.dir.iterdir() if path.name != ".lock"]
-            table = self.dir / "evaluations.csv"  # .lock and it: a run of ours was here before
-            known = (
-                (self.dir / ".lock").exists() or table.is_file() and table.read_text().startswith(EVALUATION_COLUMNS)
-            )
+            table = self.dir / "evaluations.csv"  # it or .lock: a run of ours was here before
+            ours = table.is_file() and table.read_bytes().startswith(EVALUATION_COLUMNS.encode())
+            known = ours or (self.dir / ".lock").exists()
         except UnicodeEncodeError:  # it has bytes that the locale cannot decode
             refuse(f"this locale cannot spell the folder {ascii(str(self.dir))}; PYTHONUTF8=1 helps")
         except OSError as error:

@@ -140,13 +140,13 @@ def one(line: str):
     running.touch()
     if (folder / "stop").exists():
         signals.append(signal.SIGTERM)
-    begun, finished_before = time.time(), run_folder(line) and not lacks_result(line)
-    continued = not finished_before and run_folder(line) and Path(run_folder(line)).exists()
+    begun, trained = time.time(), run_folder(line)
+    begun_before, finished_before = trained and trained.exists(), trained and not lacks_result(line)
     code, log = run(line)
     seconds = time.time() - begun
     word, why = outcome(line, code)
-    about = {"line": line, "log": str(log), "outcome": word, "why": why}
-    about |= {"seconds": 0 if finished_before or continued else seconds}  # of all its steps
+    whole = 0 if begun_before else seconds  # for all of the job's steps
+    about = {"line": line, "log": str(log), "outcome": word, "why": why, "seconds": whole}
     append(folder / "outcomes", json.dumps(about))
     running.unlink()
     if signals and code == EXIT_STOPPED:

@@ -712,7 +712,7 @@ def check_folder(folder: Path, found: dict[str, Run]):
         if path.exists() and path.relative_to(folder).as_posix() not in earlier:
             refuse(f"{path} was made by no report; name another --out-dir")
     if (folder / "runs.csv").exists():
-        before = merge([*found.values(), *read_source(folder, print)])
+        before = merge([*found.values(), *read_source(folder / "runs.csv", print)])
         if lost := [name for name in before if name not in found]:
             refuse(f"{folder} has runs that no source has ({', '.join(lost)}); name it as a source too to keep them")
     try:
