@@ -9,17 +9,15 @@
               checks: early components shuffled across states, folds of whole episodes, the observation in both models
     feedback  whether f uses what it reads: the return if it reads, in place of m_k, zero or the m_k of another state;
               and how well a network of one pass reproduces m_K
-    anytime   return of the policy stopped after k = 0..2K steps, m_k and (K/k) m_k; past K uniform goes on with
-              c_k = 1, inverse with 1/k, and average with its own 1/K
+    anytime   return of the policy stopped after k = 0..2K steps, m_k and (K/k) m_k
     adaptive  return and mean number of steps if a state's refinement stops once a correction is small
     dynamics  corrections, Jacobians of one step, spread left of random starts, proposals outside the action bounds
     training  settling, r2, dynamics and the return lost if f reads zero against the training step, from several
               checkpoints of a run (--save-every), and beside them the run's learning curve
 
-Every policy here is deterministic, and its actions are clipped to their bounds. Each section writes CSVs, figures and
-its part of summary.json into --out-dir, all at the end. With several checkpoints the CSVs gain a `checkpoint` column,
-and if these are seeds of one setting there are also `*_across_seeds.csv`, with the mean and standard deviation
-(ddof 1).
+Every policy here is deterministic, and its actions are clipped to their bounds. Each section writes CSVs, a figure and
+its part of summary.json into --out-dir, all at the end. With several checkpoints the CSVs gain a `checkpoint` column;
+if these are seeds of one setting, `*_across_seeds.csv` has the mean and standard deviation (ddof 1).
 """
 
 import io
@@ -28,7 +26,7 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from copy import copy
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -44,8 +42,9 @@ import tyro
 from matplotlib import colormaps, rc_context
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from sklearn import linear_model, metrics, model_selection, neural_network, pipeline, preprocessing
+from sklearn import linear_model, metrics, model_selection, pipeline, preprocessing
 from sklearn.exceptions import ConvergenceWarning
+from sklearn.neural_network import MLPRegressor
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
@@ -58,7 +57,6 @@ FEEDBACK_EPISODES, TRAINING_EPISODES = 100, 10  # behind each return of `feedbac
 FIT_STATES, TOLERANCES = 20_000, 8  # to which the network of one pass is fitted; that `adaptive` tries
 
 Section = Literal["settling", "r2", "feedback", "anytime", "adaptive", "dynamics", "training"]
-Rows = list[dict]  # of a table
 Mean = Callable[[np.ndarray], np.ndarray]  # normalised observations (n, obs_dim) -> action means (n, action_dim)
 progress = partial(tqdm, disable=None, leave=False)  # on a terminal only
 
@@ -71,8 +69,6 @@ class Args:
     """what to analyse"""
     num_states: int = 1000
     """states whose refinement is recorded, spread evenly over at least 20 episodes"""
-    sample_actions: bool = False
-    """record states of the stochastic policy instead of the deterministic one"""
     episodes: int = 5
     """episodes behind each return of `anytime` and `adaptive`"""
     seed: int = 0
@@ -120,12 +116,6 @@ class Policy:
 
 def load_policy(path: Path) -> Policy:
     """A checkpoint's policy on the CPU, or a refusal."""
-    try:
-        saved = set(torch.load(path, "cpu", weights_only=True)["args"])
-    except Exception:  # `load_agent` says what is wrong with a file that cannot be read
-        saved = set()
-    if saved == {field.name for field in fields(refineppo.Args)} - {"refinement_depth", "refinement_schedule"}:
-        refuse(f"{path} is a checkpoint of PPO, which has no refinement to analyse")
     agent, checkpoint = refineppo.load_agent(path), refineppo.load_checkpoint(path)
     if not all(x.isfinite().all() for part in ("params", "normalizer") for x in checkpoint[part].values()):
         refuse(f"{path} holds parameters that are not finite")
@@ -150,20 +140,16 @@ def check(args: Args) -> list[Policy]:
     """Refuse what cannot be analysed before any work starts; make the output folder and return the policies."""
     if not args.checkpoint or not args.sections:
         refuse("--checkpoint and --sections need at least one value each")
-    if args.num_states < 2 * FOLDS:
-        refuse(f"--num-states must be at least {2 * FOLDS}, two for each of the {FOLDS} folds, not {args.num_states}")
-    if args.episodes < 2 or args.seed < 0:
-        refuse(f"--episodes must be at least 2 and --seed at least 0, not {args.episodes} and {args.seed}")
+    for name, least in (("num_states", 2 * FOLDS), ("episodes", 2), ("seed", 0)):
+        if getattr(args, name) < least:
+            refuse(f"{refineppo.flag(name)} must be at least {least}, not {getattr(args, name)}")
     if len({path.resolve() for path in args.checkpoint}) < len(args.checkpoint):
         refuse("--checkpoint names a file twice")
     policies = [load_policy(path) for path in args.checkpoint]
     settings = [(p.args.env_id, p.args.refinement_depth, p.args.refinement_schedule) for p in policies]
-    for path, setting in zip(args.checkpoint, settings):
-        if setting != settings[0]:
-            both = f"{args.checkpoint[0]} has {settings[0]}, {path} has {setting}"
-            refuse(f"the checkpoints must have the same task, depth and schedule: {both}")
-    if set(args.sections) == {"r2"} and len(policies[0].names) == 1:
-        refuse(f"an action of {settings[0][0]} has one component, which no other can inform: there is no delta R^2")
+    if len(set(settings)) > 1:
+        each = ", ".join(f"{path} has {setting}" for path, setting in zip(args.checkpoint, settings))
+        refuse(f"the checkpoints must have the same task, depth and schedule: {each}")
     if "training" in args.sections:
         seeds = [seed for seed, _ in {(p.args.seed, p.global_step) for p in policies}]
         if any(seeds.count(seed) == 1 for seed in seeds):
@@ -191,8 +177,7 @@ def run_episodes(policy: Policy, mean: Mean, seeds: list[int]) -> tuple[np.ndarr
 
 
 def final_returns(policy: Policy, mean: Mean, episodes: int) -> tuple[np.ndarray, dict]:
-    """Returns in the episodes of `refineppo_continuous.py --evaluate`, the same for every mean; and a table's columns
-    of them."""
+    """Returns in the episodes of --evaluate, the same for every mean; and a table's columns of them."""
     args = replace(policy.args, final_eval_episodes=episodes)
     seeds = refineppo.evaluation_seeds(args, policy.global_step, final=True)
     returns, lengths = run_episodes(policy, mean, seeds)
@@ -211,31 +196,20 @@ def spread_evenly(lengths: np.ndarray, total: int) -> list[np.ndarray]:
 
 
 def record_states(policy: Policy, args: Args, stream: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """Normalised observations (S, obs_dim) of 20 episodes, or more if they are short; and each one's episode, (S,).
-    Another `stream` has other episodes."""
-    own, std, rng = policy.mean(), np.exp(policy.agent.arrays()["log_std"]), np.random.default_rng(args.seed)
-    episodes = []
+    """Normalised observations (S, obs_dim) of 20 or more episodes of a stream; and each one's episode, (S,)."""
+    own, episodes = policy.mean(), []
 
     def mean(obs: np.ndarray) -> np.ndarray:
         episodes[-1].append(obs)
-        bar.update()
-        m = own(obs)
-        return m + std * rng.standard_normal(m.shape) if args.sample_actions else m
+        return own(obs)
 
-    with progress(desc=f"episodes of {policy.label}", unit=" steps") as bar:
-        while sum(map(len, episodes)) < args.num_states:
-            for seed in refineppo.episode_seeds(args.seed, stream, len(episodes), count=MIN_EPISODES):
-                episodes.append([])
-                run_episodes(policy, mean, [seed])
+    while sum(map(len, episodes)) < args.num_states:
+        for seed in refineppo.episode_seeds(args.seed, stream, len(episodes), count=MIN_EPISODES):
+            episodes.append([])
+            run_episodes(policy, mean, [seed])
     chosen = spread_evenly(np.array([len(obs) for obs in episodes]), args.num_states)
     obs = np.concatenate([np.concatenate(obs)[steps] for obs, steps in zip(episodes, chosen)])
     return obs, np.repeat(np.arange(len(chosen)), [len(steps) for steps in chosen])
-
-
-def continued_coefficients(args: refineppo.Args) -> list[float]:
-    """c_1, ..., c_2K: the policy's own K; past them uniform keeps 1, average keeps 1/K, inverse goes on with 1/k."""
-    own, twice = refineppo.refinement_coefficients(args), replace(args, refinement_depth=2 * args.refinement_depth)
-    return own * 2 if args.refinement_schedule == "average" else refineppo.refinement_coefficients(twice)
 
 
 # --- Quantities -------------------------------------------------------------------------------------------------------
@@ -276,9 +250,7 @@ def fit_one_pass(obs: np.ndarray, target: np.ndarray, seed: int) -> list[tuple[n
     """(weight, bias) pairs of a network obs -> 128 tanh -> 128 tanh -> target, fitted by least squares on components
     of equal weight. A tenth of the states says when to stop."""
     centre, scale = target.mean(0), np.maximum(target.std(0), 1e-8)
-    network = neural_network.MLPRegressor(
-        hidden_layer_sizes=(128, 128), activation="tanh", early_stopping=True, random_state=seed
-    )
+    network = MLPRegressor(hidden_layer_sizes=(128, 128), activation="tanh", early_stopping=True, random_state=seed)
     with warnings.catch_warnings(action="ignore", category=ConvergenceWarning):  # 200 epochs are enough
         network.fit(obs, ((target - centre) / scale).squeeze())
     *hidden, (w_out, b_out) = zip(network.coefs_, network.intercepts_)
@@ -291,44 +263,10 @@ def step_jacobians(weights: list, obs: torch.Tensor, m: torch.Tensor, c: float) 
     return torch.eye(m.shape[1], dtype=m.dtype) + c * jacobian(weights, obs, m)
 
 
-def start_spread(weights: list, obs: torch.Tensor, starts: torch.Tensor, coefficients: list[float]) -> np.ndarray:
-    """Root of the mean squared distance of m_k from its mean over the starts m_0 (R, S, action_dim), as a fraction of
-    that of m_0, for k = 0..K, (K + 1, S). 0 at the end: the refinement forgets where it started."""
-    spreads, m = [], starts
-    for c in (0.0, *coefficients):
-        m = torch.stack([m_r + c * refinement_field(weights, obs, m_r) for m_r in m])
-        spreads.append((m - m.mean(0)).square().sum(-1).mean(0).sqrt())
-    return torch.stack(spreads).div(spreads[0]).numpy()
-
-
-def dynamics(policy: Policy, obs: np.ndarray, proposals: np.ndarray, seed: int) -> dict[str, dict[int, np.ndarray]]:
-    """The refinement as a dynamical system: quantity -> step k -> its value in every state, (S,)."""
-    agent, coefficients = policy.agent, policy.coefficients
-    weights = layers({name: p.double() for name, p in agent.params.items()}, "actor")
-    obs, space = torch.from_numpy(obs).double(), gym.spaces.Box(agent.low, agent.high, seed=seed)
-    starts = torch.from_numpy(np.array([[space.sample() for _ in obs] for _ in range(STARTS)])).double()
-    outside = ((proposals < agent.low) | (proposals > agent.high)).astype(float)
-    norms, steps = correction_norms(proposals), range(1, len(proposals))
-    singular_values, radii = {}, {}
-    for k, c in zip(steps, progress(coefficients, desc="Jacobians")):
-        jacobians = step_jacobians(weights, obs, torch.from_numpy(proposals[k - 1]), c).numpy()
-        singular_values[k] = np.linalg.svd(jacobians, compute_uv=False)[:, 0]
-        radii[k] = np.abs(np.linalg.eigvals(jacobians)).max(-1)
-    return {
-        "correction_norm": {k: norms[k - 1] for k in steps},
-        "correction_ratio": {k: norms[k - 1] / np.maximum(norms[k - 2], 1e-12) for k in steps[1:]},
-        "largest_singular_value": singular_values,
-        "spectral_radius": radii,
-        "spread_of_random_starts": dict(enumerate(start_spread(weights, obs, starts, coefficients))),
-        "proposals_outside_bounds": {k: outside[k].max(-1) for k in steps},
-        "components_outside_bounds": {k: outside[k].mean(-1) for k in steps},
-    }
-
-
 # --- Sections: their tables -------------------------------------------------------------------------------------------
 
 
-def settling_rows(proposals: np.ndarray, names: list[str]) -> Rows:
+def settling_rows(proposals: np.ndarray, names: list[str]) -> list[dict]:
     """Every e_{k,j}, in the order of e_{1,j}."""
     error = settling_error(proposals)
     ranked = list(enumerate(early_and_late(error)[0], start=1))
@@ -370,16 +308,13 @@ def r2_tables(proposals: np.ndarray, names: list[str], obs: np.ndarray, episodes
     return tables
 
 
-def feedback_rows(policy: Policy, obs: np.ndarray, proposals: np.ndarray, args: Args) -> Rows:
-    """Whether the policy uses what f reads, by what is lost if f reads something else, x_k, in place of m_k, while the
-    corrections add up as before: m_K = c_1 f(s, x_0) + ... + c_K f(s, x_{K-1}).
+def feedback_rows(policy: Policy, obs: np.ndarray, proposals: np.ndarray, args: Args) -> list[dict]:
+    """Whether the policy uses what f reads: f reads x_k in place of m_k, m_K = c_1 f(s, x_0) + ... + c_K f(s, x_{K-1}).
 
         own            x_k = m_k(s), as trained
-        zero           x_k = 0 at every step, so that m_K = (c_1 + ... + c_K) f(s, 0)
-        another_state  x_k = m_k(s'); the state s' is drawn anew at every step of an episode, uniformly from the
-                       recorded ones: `obs` (S, obs_dim), whose m_0, ..., m_K are `proposals` (K + 1, S, action_dim)
-        one_pass       no f: a network s -> 128 tanh -> 128 tanh -> action, fitted to m_K(s) in 20,000 states of other
-                       episodes of the policy
+        zero           x_k = 0, so that m_K = (c_1 + ... + c_K) f(s, 0)
+        another_state  x_k = m_k(s'), of a recorded state s' (obs, proposals) drawn anew at every step of an episode
+        one_pass       no f: a network s -> 128 tanh -> 128 tanh -> action, fitted to m_K(s) in 20,000 other states
 
     return: of 100 episodes, the same for every row; lost: the own return minus this one, paired by episode; r2: R^2
     with which the row's m_K reproduces the own one in the recorded states, mean over action components.
@@ -406,11 +341,13 @@ def feedback_rows(policy: Policy, obs: np.ndarray, proposals: np.ndarray, args: 
     return rows
 
 
-def anytime_tables(policy: Policy, episodes: int) -> dict[str, Rows]:
-    """Return of a = m_k for k = 0..2K; and of a = (K/k) m_k for k = 1..2K, since under the average schedule m_k is
-    about k/K as large as m_K."""
+def anytime_tables(policy: Policy, episodes: int) -> dict[str, list[dict]]:
+    """Return of a = m_k for k = 0..2K, and of (K/k) m_k, under the average schedule about as large as m_K. Past K
+    uniform keeps c_k = 1, average its own 1/K, and inverse goes on with 1/k."""
     depth, tables = policy.args.refinement_depth, {"anytime": [], "anytime_scaled": []}
-    coefficients = continued_coefficients(policy.args)
+    coefficients = refineppo.refinement_coefficients(replace(policy.args, refinement_depth=2 * depth))
+    if policy.args.refinement_schedule == "average":
+        coefficients = policy.coefficients * 2
     for k in progress(range(len(coefficients) + 1), desc=f"anytime, {policy.label}"):
         own = coefficients[:k] or [0.0]  # m_0 = 0
         tables["anytime"].append({"steps": k} | final_returns(policy, policy.mean(own), episodes)[1])
@@ -420,7 +357,7 @@ def anytime_tables(policy: Policy, episodes: int) -> dict[str, Rows]:
     return tables
 
 
-def adaptive_rows(policy: Policy, norms: np.ndarray, episodes: int) -> Rows:
+def adaptive_rows(policy: Policy, norms: np.ndarray, episodes: int) -> list[dict]:
     """Return and mean steps used if a state's refinement ends with the first correction below a tolerance, for
     tolerances that spread the mean steps as evenly as they can.
 
@@ -453,32 +390,54 @@ def adaptive_rows(policy: Policy, norms: np.ndarray, episodes: int) -> Rows:
     return [rows[quantile] for quantile in sorted(rows)]
 
 
-def dynamics_rows(values: dict[str, dict[int, np.ndarray]]) -> Rows:
-    """Median over states, and 10th and 90th percentile; of what is outside the bounds the mean instead."""
+def dynamics_rows(policy: Policy, obs: np.ndarray, proposals: np.ndarray, seed: int) -> list[dict]:
+    """The refinement as a dynamical system: median over states, and 10th and 90th percentile; of what is outside the
+    bounds the mean instead."""
+    agent, coefficients = policy.agent, policy.coefficients
+    weights = layers({name: p.double() for name, p in agent.params.items()}, "actor")
+    obs, space = torch.from_numpy(obs).double(), gym.spaces.Box(agent.low, agent.high, seed=seed)
+    starts = torch.from_numpy(np.array([[space.sample() for _ in obs] for _ in range(STARTS)])).double()
+    outside = ((proposals < agent.low) | (proposals > agent.high)).astype(float)
+    norms, steps = correction_norms(proposals), range(1, len(proposals))
+    spreads, m = [], starts  # of m_k around its mean over the starts; 0 at the end: it forgets where it started
+    for c in (0.0, *coefficients):
+        m = torch.stack([m_r + c * refinement_field(weights, obs, m_r) for m_r in m])
+        spreads.append((m - m.mean(0)).square().sum(-1).mean(0).sqrt())
+    singular_values, radii = {}, {}
+    for k, c in zip(steps, progress(coefficients, desc="Jacobians")):
+        jacobians = step_jacobians(weights, obs, torch.from_numpy(proposals[k - 1]), c).numpy()
+        singular_values[k] = np.linalg.svd(jacobians, compute_uv=False)[:, 0]
+        radii[k] = np.abs(np.linalg.eigvals(jacobians)).max(-1)
+    quantities = {  # of every step k its value in every state, (S,)
+        "correction_norm": {k: norms[k - 1] for k in steps},
+        "correction_ratio": {k: norms[k - 1] / np.maximum(norms[k - 2], 1e-12) for k in steps[1:]},
+        "largest_singular_value": singular_values,
+        "spectral_radius": radii,
+        "spread_of_random_starts": dict(enumerate(torch.stack(spreads).div(spreads[0]).numpy())),
+        "proposals_outside_bounds": {k: outside[k].max(-1) for k in steps},
+        "components_outside_bounds": {k: outside[k].mean(-1) for k in steps},
+    }
     rows = []
-    for quantity, steps in values.items():
+    for quantity, values in quantities.items():
         centre = np.mean if "outside" in quantity else np.median
-        for k, x in steps.items():
+        for k, x in values.items():
             low, high = np.quantile(x, (0.1, 0.9))
             rows.append({"quantity": quantity, "step": k, "value": centre(x), "q10": low, "q90": high})
     return rows
 
 
-def training_rows(policy: Policy, obs: np.ndarray, proposals: np.ndarray, seed: int) -> Rows:
+def training_rows(policy: Policy, obs: np.ndarray, proposals: np.ndarray, seed: int) -> list[dict]:
     """e_k (mean over components), delta R^2 of the step to k (mean over late components), the dynamics, and under
     k = K the return lost if f reads zero at every step, as in `feedback`."""
     values = [("settling_error", row["step"], row["error"]) for row in settling_rows(proposals, policy.names)]
     values += [("delta_r2", row["step_to"], row["delta_r2"]) for row, *_ in r2_rows(proposals, policy.names)]
-    rows = dynamics_rows(dynamics(policy, obs, proposals, seed))
-    values += [(row["quantity"], row["step"], row["value"]) for row in rows]
+    values += [(row["quantity"], row["step"], row["value"]) for row in dynamics_rows(policy, obs, proposals, seed)]
     means = policy.mean(), policy.reading_zero()
     own, zero = (final_returns(policy, mean, TRAINING_EPISODES)[0] for mean in means)
     values.append(("return_lost_reading_zero", policy.args.refinement_depth, np.mean(own - zero)))
-    means = {}
-    for quantity, k, value in values:
-        means.setdefault((quantity, k), []).append(value)
-    run = {"seed": policy.args.seed, "global_step": policy.global_step}
-    return [run | {"quantity": quantity, "step": k, "value": np.mean(x)} for (quantity, k), x in means.items()]
+    columns = ["seed", "global_step", "quantity", "step", "value"]
+    table = pd.DataFrame([(policy.args.seed, policy.global_step, *row) for row in values], columns=columns)
+    return table.groupby(columns[:-1], sort=False, as_index=False).mean().to_dict("records")
 
 
 def analyse(policy: Policy, args: Args) -> dict[str, pd.DataFrame]:
@@ -491,35 +450,37 @@ def analyse(policy: Policy, args: Args) -> dict[str, pd.DataFrame]:
         "feedback": lambda: {"feedback": feedback_rows(policy, obs, proposals, args)},
         "anytime": lambda: anytime_tables(policy, args.episodes),
         "adaptive": lambda: {"adaptive": adaptive_rows(policy, correction_norms(proposals), args.episodes)},
-        "dynamics": lambda: {"dynamics": dynamics_rows(dynamics(policy, obs, proposals, args.seed))},
+        "dynamics": lambda: {"dynamics": dynamics_rows(policy, obs, proposals, args.seed)},
         "training": lambda: {"training": training_rows(policy, obs, proposals, args.seed)},
     }
     tables, path = {}, {"checkpoint": str(policy.path)}
-    for section in set(args.sections):
-        for name, rows in sections[section]().items():
+    for section in sections:
+        for name, rows in sections[section]().items() if section in args.sections else ():
             tables |= {name: pd.DataFrame([path | row for row in rows])} if rows else {}
     return tables
 
 
 # --- Tables across checkpoints, and as text ---------------------------------------------------------------------------
 
-KEYS = {  # of every section's tables: the columns that name a row
-    "settling": {"settling_error": ["component", "step"]},
-    "r2": dict.fromkeys(("delta_r2", "delta_r2_checks"), ["component", "step_from", "step_to"]),
-    "feedback": {"feedback": ["reads"]},
-    "anytime": dict.fromkeys(("anytime", "anytime_scaled"), ["steps"]),
-    "adaptive": {"adaptive": ["quantile"]},
-    "dynamics": {"dynamics": ["quantity", "step"]},
-    "training": {"training": ["quantity", "step", "global_step"]},
+KEYS = {  # the columns that name a row of a table
+    "settling_error": ["component", "step"],
+    **dict.fromkeys(("delta_r2", "delta_r2_checks"), ["component", "step_from", "step_to"]),
+    "feedback": ["reads"],
+    **dict.fromkeys(("anytime", "anytime_scaled"), ["steps"]),
+    "adaptive": ["quantile"],
+    "dynamics": ["quantity", "step"],
+    "training": ["quantity", "step", "global_step"],
 }
-WIDE = {"settling": ("step", "error"), "dynamics": ("step", "value"), "training": ("global_step", "value")}
+WIDE = {"settling_error": ("step", "error"), "dynamics": ("step", "value"), "training": ("global_step", "value")}
 
 
-def pivot(table: pd.DataFrame, keys: list[str], column: str, value: str) -> pd.DataFrame:
-    """A column for every value of `column`, ascending, and a row for those of the other keys, as they appear."""
-    index = table[[key for key in keys if key != column]].astype(str).agg(" ".join, axis=1)
-    wide = table.assign(index=index).pivot(index="index", columns=column, values=value)
-    return wide.loc[index.unique()].rename_axis(index=None, columns=None)
+def compact(table: pd.DataFrame, keys: list[str], column: str = "", value: str = "") -> pd.DataFrame:
+    """A row for every combination of the keys, which are its name; with a `column`, that key's values side by side."""
+    names = table[[key for key in keys if key != column]].astype(str).agg(" ".join, axis=1)
+    if not column:
+        return table.drop(columns=["checkpoint", *keys]).set_index(names.rename(None))
+    wide = table.assign(row=names).pivot(index="row", columns=column, values=value)
+    return wide.loc[names.unique()].rename_axis(index=None, columns=None)
 
 
 def across_seeds(table: pd.DataFrame, keys: list[str]) -> pd.DataFrame:
@@ -530,23 +491,6 @@ def across_seeds(table: pd.DataFrame, keys: list[str]) -> pd.DataFrame:
     statistics.columns = ["_".join(column) for column in statistics.columns]
     statistics.insert(0, "seeds", groups.size())
     return statistics.reset_index()
-
-
-def as_text(rows: pd.DataFrame, section: str, keys: list[str]) -> str:
-    """A table of aligned columns."""
-    narrow = rows.drop(columns="checkpoint").set_index(keys).rename_axis([None] * len(keys))
-    shown = pivot(rows, keys, *WIDE[section]) if section in WIDE else narrow
-    return shown.to_string(float_format="{:.4g}".format, na_rep="", sparsify=False)
-
-
-def as_summary(rows: pd.DataFrame, section: str, keys: list[str]) -> dict | Rows:
-    """What one checkpoint's table comes to; of regressions the mean of every column over components and steps."""
-    if section in WIDE:
-        return {label: row.dropna().to_dict() for label, row in pivot(rows, keys, *WIDE[section]).iterrows()}
-    values = rows.drop(columns="checkpoint")
-    if section == "r2":
-        return {name: np.mean(x.to_numpy()) for name, x in values.drop(columns=keys).items()}
-    return values.to_dict("records")
 
 
 # --- Figures ----------------------------------------------------------------------------------------------------------
@@ -578,10 +522,8 @@ class Figures:
         labels = {str(p.path): p.label if labels.count(p.label) == 1 else str(p.path) for p in policies}
         self.tables = {name: rows.assign(line=rows["checkpoint"].map(labels)) for name, rows in tables.items()}
         self.policies, self.episodes, self.depth = policies, args.episodes, policies[0].args.refinement_depth
-        self.single, self.seeds = (
-            len(policies) == 1,
-            len({policy.args.seed for policy in policies}) == len(policies) > 1,
-        )
+        self.single = len(policies) == 1
+        self.seeds = len({policy.args.seed for policy in policies}) == len(policies) > 1
         self.schedule = policies[0].args.refinement_schedule
         self.title = f"{policies[0].args.env_id}, $K = {self.depth}$, {self.schedule} schedule"
         self.title += f", {policies[0].label}" if self.single else ""
@@ -600,14 +542,13 @@ class Figures:
         return figure, axes[: len(titles)]
 
     def heatmaps(self, what: str, label: str, rows: pd.DataFrame, names: list[str], value: str, text, width: float):
-        """Component by column `at`, a panel per checkpoint (with seeds also mean and std), all on one colour scale; a
-        cell says `text(value)`."""
+        """Component by column `at`, a panel per checkpoint (of seeds also mean and std), all on one colour scale."""
         keys = ["component", "at"]
-        panels = {line: pivot(group, keys, "at", value) for line, group in rows.groupby("line", sort=False)}
+        panels = {line: compact(group, keys, "at", value) for line, group in rows.groupby("line", sort=False)}
         if self.seeds:
             across = across_seeds(rows[["checkpoint", *keys, value]], keys)
-            panels["mean over seeds"] = pivot(across, keys, "at", f"{value}_mean")
-            panels["std over seeds"] = pivot(across[across["seeds"] > 1], keys, "at", f"{value}_std")
+            panels["mean over seeds"] = compact(across, keys, "at", f"{value}_mean")
+            panels["std over seeds"] = compact(across[across["seeds"] > 1], keys, "at", f"{value}_std")
         columns, norm = rows["at"].unique(), Normalize(min(0.0, rows[value].min()), rows[value].max())
         width, height, titles = width * len(columns) + 0.2, 0.17 * len(names) + 0.6, [""] if self.single else panels
         figure, axes = self.axes(what, titles, max(1, int(8 / width)), width, height, sharey=True)
@@ -624,8 +565,7 @@ class Figures:
         return figure
 
     def lines(self, what: str, panels: dict[str, pd.DataFrame], columns: int, width: float, height: float, **labels):
-        """`y` against `x` for every `line`, with bars from `low` to `high`, a panel per table, all with these labels;
-        with seeds also their mean, where they have the same x."""
+        """`y` against `x` for every `line`, bars from `low` to `high`, a panel per table; of seeds also the mean."""
         figure, axes = self.axes(what, panels, columns, width, height)
         names = pd.concat(panels.values())["line"].unique().tolist()
         for axis, rows in zip(axes, panels.values()):
@@ -639,9 +579,9 @@ class Figures:
                 mean = rows.groupby("x", sort=False)["y"].mean()
                 axis.plot(mean.index, mean, "k--", linewidth=1.5, label="mean over seeds")
             axis.set(**labels)
-        return figure, axes
+        return figure
 
-    def settling(self) -> dict[str, Figure]:
+    def settling_error(self) -> Figure:
         """Figure 3a, with a row for a correction that never changes, so that m_k only grows with the schedule."""
         rows, constant = self.tables["settling_error"].rename(columns={"step": "at"}), "(constant $f$)"
         done = np.cumsum([0, *self.policies[0].coefficients])
@@ -650,35 +590,16 @@ class Figures:
         checkpoints = rows[["checkpoint", "line"]].drop_duplicates()
         rows = pd.concat([rows, checkpoints.merge(steps, how="cross")])
         what, label = "Remaining refinement by action component", "$e_{k,j}$ (dark: far from its end)"
-        heatmap = self.heatmaps(what, label, rows, [*names, constant], "error", "{:.2f}".format, width=0.34)
-        return {"settling_error": heatmap}
+        return self.heatmaps(what, label, rows, [*names, constant], "error", "{:.2f}".format, width=0.34)
 
-    def r2(self) -> dict[str, Figure]:
-        """Figure 3b, and its numbers beside the three checks."""
-        rows, checks = self.tables["delta_r2"], self.tables["delta_r2_checks"]
-        rows, checks = (
-            x.assign(at=x["step_from"].astype(str) + "→" + x["step_to"].astype(str)) for x in (rows, checks)
-        )
+    def delta_r2(self) -> Figure:
+        """Figure 3b."""
+        rows = self.tables["delta_r2"]
+        rows = rows.assign(at=rows["step_from"].astype(str) + "→" + rows["step_to"].astype(str))
         what, label = "What early components add to the prediction of late corrections", r"$\Delta R^2$ (dark: large)"
-        names = rows["component"].unique().tolist()
-        heatmap = self.heatmaps(what, label, rows, names, "delta_r2", "{:.2g}".format, width=0.48)
-        title = checks["at"] if self.single else checks["line"] + "\n" + checks["at"]
-        panels = dict(list(checks.groupby(title, sort=False)))
-        columns, height = min(4, self.depth - 1), 0.15 * max(map(len, panels.values())) + 0.9
-        figure, axes = self.axes(r"$\Delta R^2$ and three checks", panels, columns, 1.8, height, sharex=True)
-        for axis, x in zip(axes, panels.values()):
-            y = np.arange(len(x))
-            axis.axvline(0, color="0.6", linewidth=0.7)
-            axis.hlines(y, x["shuffled_low"], x["shuffled_high"], "0.75", linewidth=6, label="shuffled (95 %)")
-            axis.plot(x["delta_r2"], y, "ko", markersize=3.5, label="the paper's")
-            axis.plot(x["by_episode"], y, "ks", markersize=6.5, fillstyle="none", label="folds of whole episodes")
-            axis.plot(x["given_observation"], y, "kx", markersize=4.5, label="observation in both models")
-            axis.set_yticks(y, x["component"])
-            axis.set(ylim=(len(y) - 0.5, -0.5), xlabel=r"$\Delta R^2$")
-            axis.locator_params(axis="x", nbins=3)
-        return {"delta_r2": heatmap, "delta_r2_checks": figure}
+        return self.heatmaps(what, label, rows, rows["component"].unique(), "delta_r2", "{:.2g}".format, width=0.48)
 
-    def feedback(self) -> dict[str, Figure]:
+    def feedback(self) -> Figure:
         rows = self.tables["feedback"].assign(points=True)
         rows["reads"] = rows["reads"].str.replace("_", "\n")
         panels = {
@@ -686,59 +607,47 @@ class Figures:
             "return lost, paired by episode": mean_with_bars(rows, "reads", "lost", FEEDBACK_EPISODES),
             "$R^2$ of $m_K$ in recorded states": rows.rename(columns={"reads": "x", "r2": "y"}),
         }
-        what = "What $f$ reads in place of $m_k$ (mean and standard error)"
-        figure, _ = self.lines(what, panels, 3, 2.0, 1.9, xmargin=0.15)
-        return {"feedback": figure}
+        return self.lines("What $f$ reads in place of $m_k$ (mean, standard error)", panels, 3, 2.0, 1.9, xmargin=0.15)
 
-    def anytime(self) -> dict[str, Figure]:
+    def anytime(self) -> Figure:
         names = {"acting with $m_k$": "anytime", "acting with $(K/k) m_k$": "anytime_scaled"}
         panels = {title: mean_with_bars(self.tables[x], "steps", "return", self.episodes) for title, x in names.items()}
         label = f"steps $k$ (dotted: $K$; past it {PAST_K[self.schedule]})"
         what = f"Return of the policy stopped after $k$ steps (mean and standard error, {self.episodes} episodes)"
-        figure, axes = self.lines(what, panels, 2, 2.6, 2.1, xlabel=label)
-        low, high = zip(*(axis.get_ylim() for axis in axes))
-        for axis in axes:
+        figure = self.lines(what, panels, 2, 2.6, 2.1, xlabel=label)
+        low, high = zip(*(axis.get_ylim() for axis in figure.axes))
+        for axis in figure.axes:
             axis.axvline(self.depth, color="0.5", linestyle=":")
             axis.set_ylim(min(low), max(high))
-        return {"anytime": figure}
+        return figure
 
-    def adaptive(self) -> dict[str, Figure]:
+    def adaptive(self) -> Figure:
         """Points without lines: what lies between two tolerances was not measured."""
         rows = mean_with_bars(self.tables["adaptive"], "steps_mean", "return", self.episodes).assign(points=True)
+        what = f"Return if refinement stops at a small correction (mean and standard error, {self.episodes} episodes)"
         label = f"mean steps used (tolerance from 0 at $K$ to {rows['tolerance'].max():.2g} on the left)"
-        labels = {"xlabel": label, "ylabel": f"return (mean, standard error, {self.episodes} episodes)"}
-        figure, (axis,) = self.lines(
-            "Return if refinement stops at a small correction", {"": rows}, 1, 3.6, 2.4, **labels
-        )
+        figure = self.lines(what, {"": rows}, 1, 3.6, 2.4, xlabel=label)
         if "anytime" in self.tables and (self.single or self.seeds):
             fixed = self.tables["anytime"].groupby("steps")["return_mean"].mean().loc[1 : self.depth]
-            axis.plot(fixed.index, fixed, "kx", label="the same number of steps in every state")
-        return {"adaptive": figure}
+            figure.axes[0].plot(fixed.index, fixed, "kx", label="the same number of steps in every state")
+        return figure
 
-    def dynamics(self) -> dict[str, Figure]:
-        columns = {"step": "x", "value": "y", "q10": "low", "q90": "high"}
-        rows = self.tables["dynamics"].rename(columns=columns)
+    def dynamics(self) -> Figure:
+        rows = self.tables["dynamics"].rename(columns={"step": "x", "value": "y", "q10": "low", "q90": "high"})
         panels = dict(list(rows.groupby(rows["quantity"].str.replace("_", " "), sort=False)))
         panels = {name: x.drop(columns=["low", "high"]) if "outside" in name else x for name, x in panels.items()}
         what, limits = "Dynamics of the refinement (median and 10 to 90 % of states)", (-0.3, self.depth + 0.3)
-        figure, axes = self.lines(what, panels, 4, 1.65, 1.5, xlabel="step $k$", xlim=limits)
-        for axis, quantity in zip(axes, panels):
+        figure = self.lines(what, panels, 4, 1.65, 1.5, xlabel="step $k$", xlim=limits)
+        for axis, quantity in zip(figure.axes, panels):
             if quantity in AROUND_ONE:
                 axis.axhline(1, color="0.5", linestyle=":")
             if "outside" in quantity:
                 axis.set(ylabel="fraction", ylim=(-0.05, 1.05))
-        return {"dynamics": figure}
+        return figure
 
-    def training(self) -> dict[str, Figure]:
-        """Every quantity, a line per step k, averaged over seeds; and what says when refinement begins, a line per
-        seed, beside the learning curve."""
-        table, what = self.tables["training"], "Refinement through training"
-        average = across_seeds(table.drop(columns="line"), KEYS["training"]["training"]).sort_values("global_step")
-        average["line"] = "$k = " + average["step"].astype(str) + "$"
-        average = mean_with_bars(average, "global_step", "value")
-        panels = dict(list(average.groupby(average["quantity"].str.replace("_", " "), sort=False)))
-        by_step, _ = self.lines(f"{what} (mean and std over seeds)", panels, 3, 2.0, 1.4, xlabel="training step")
-
+    def training(self) -> Figure:
+        """When refinement begins: what tells it, a line per seed, beside the learning curve."""
+        table = self.tables["training"]
         files = {policy.path.with_name("evaluations.csv"): policy.args.seed for policy in self.policies}
         curves = [pd.read_csv(path).assign(seed=seed) for path, seed in files.items() if path.exists()]
         curves = [curve.assign(quantity="evaluation return", value=curve["return_mean"]) for curve in curves]
@@ -748,17 +657,15 @@ class Figures:
         rows = rows.rename(columns={"global_step": "x", "value": "y"}).sort_values(["seed", "x"], kind="stable")
         rows["line"] = "seed " + rows["seed"].astype(str)
         panels = dict(list(rows.groupby("quantity", sort=False)))
-        by_seed, _ = self.lines(f"{what}, a line per seed", panels, 3, 2.4, 1.5, xlabel="training step")
-        return {"training": by_step, "training_by_seed": by_seed}
+        return self.lines("Refinement through training, a line per seed", panels, 3, 2.4, 1.5, xlabel="training step")
 
 
 def as_png(figure: Figure) -> bytes:
     """The picture, with one legend below all axes."""
-    lines = [axis.get_legend_handles_labels() for axis in figure.axes]
-    legend = {label: handle for handles, labels in lines for handle, label in zip(handles, labels)}
-    if len(legend) > 1:
-        columns = max(1, int(figure.get_figwidth() / (0.6 + 0.05 * max(map(len, legend)))))
-        figure.legend(legend.values(), legend, loc="outside lower center", ncols=columns, frameon=False)
+    lines, names = figure.axes[0].get_legend_handles_labels()  # the same in all
+    if len(names) > 1:
+        columns = max(1, int(figure.get_figwidth() / (0.6 + 0.05 * max(map(len, names)))))
+        figure.legend(lines, names, loc="outside lower center", ncols=columns, frameon=False)
     image = io.BytesIO()
     figure.savefig(image, format="png")
     return image.getvalue()
@@ -777,26 +684,22 @@ def main():
     tables = {name: pd.concat([part[name] for part in parts], ignore_index=True) for name in parts[0]}
 
     files, figures = {}, Figures(policies, args, tables)
-    facts = ("env_id", "seed", "refinement_depth", "refinement_schedule")
-    facts = {str(p.path): {"global_step": p.global_step} | {x: getattr(p.args, x) for x in facts} for p in policies}
-    summary = {"flags": asdict(args), "checkpoints": facts}
-    for section, keys_of in KEYS.items():
-        for name, keys in keys_of.items():
-            if name not in tables:
-                continue
-            rows = tables[name]
-            for path, group in rows.groupby("checkpoint", sort=False):
-                summary.setdefault(section, {}).setdefault(path, {})[name] = as_summary(group, section, keys)
-            for whose, group in rows.groupby("seed" if section == "training" else "checkpoint", sort=False):
-                print(f"\n{name}{f' of {whose}' if several else ''}\n{as_text(group, section, keys)}")
-            rows = rows if several else rows.drop(columns="checkpoint")
-            files[f"{name}.csv"] = rows
-            if figures.seeds or section == "training" and rows["seed"].nunique() > 1:
-                files[f"{name}_across_seeds.csv"] = across_seeds(rows, keys)
-    files = {name: table.to_csv(index=False, lineterminator="\n").encode() for name, table in files.items()}
-    for section in set(args.sections) & summary.keys():
-        with rc_context(STYLE):
-            files |= {f"{name}.png": as_png(figure) for name, figure in getattr(figures, section)().items()}
+    checkpoints = {str(p.path): {"global_step": p.global_step, **asdict(p.args)} for p in policies}
+    summary = {"flags": asdict(args), "checkpoints": checkpoints}
+    for name, rows in tables.items():
+        for whose, group in rows.groupby("seed" if name == "training" else "checkpoint", sort=False):
+            shown = compact(group, KEYS[name], *WIDE.get(name, ()))
+            print(f"\n{name}{f' of {whose}' if several else ''}")
+            print(shown.to_string(float_format="{:.4g}".format, na_rep=""))
+            shown = shown.astype(object).where(shown.notna(), None)  # JSON has no NaN
+            summary.setdefault(name, {})[str(whose)] = shown.to_dict("index")
+        rows = rows if several else rows.drop(columns="checkpoint")
+        files[f"{name}.csv"] = rows.to_csv(index=False).encode()
+        if figures.seeds or name == "training" and rows["seed"].nunique() > 1:
+            files[f"{name}_across_seeds.csv"] = across_seeds(rows, KEYS[name]).to_csv(index=False).encode()
+        if hasattr(figures, name):
+            with rc_context(STYLE):
+                files[f"{name}.png"] = as_png(getattr(figures, name)())
     files["summary.json"] = json.dumps(summary, indent=2, default=str).encode()
     try:
         for name, data in files.items():

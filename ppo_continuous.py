@@ -1099,8 +1099,9 @@ def load_checkpoint(path: Path) -> dict:
         torn, state = True, None
     if torn or not isinstance(state, dict) or not state.keys() >= {"args", "global_step", "params", "normalizer"}:
         refuse(f"{path} is damaged or not a checkpoint of {SCRIPT}")
-    if state["args"].keys() != {flag.name for flag in fields(Args)}:
-        refuse(f"{path} was not written by this {SCRIPT}: it has other flags")
+    unlike = sorted(state["args"].keys() ^ {x.name for x in fields(Args)})
+    if unlike:
+        refuse(f"{path} was not written by this {SCRIPT}: only one of them has {', '.join(map(flag, unlike))}")
     return state | {"path": str(path)}
 
 
