@@ -1,19 +1,12 @@
 """Tiny environments, each of which asks one thing; use them as `probe_envs:NAME-v0`.
 
-Learning; the observation is uniform in [-1, 1], the actions are bounded by +-1:
-    ConstantReward-v0   one step, reward 1: the value must become 1
-    MatchAction-v0      one step: act as the observation says, a* = -s
-    TwoStepCredit-v0    two steps: the first action decides the reward of the second step
-The reward is minus the squared distance from the right action.
-
-Bookkeeping; the observation is the number of steps in the episode, the reward of step n is the integer n,
-the action is ignored:
-    Counter-v0          truncated after 7 steps (max_episode_steps)
-    Terminator-v0       terminated after 5 steps
-
-Spaces; episodes of 50 steps with reward 0:
-    Unbounded-v0        two actions without bounds
-    Discrete-v0         two discrete actions, unsupported
+ConstantReward      one step, reward 1: the value must become 1
+MatchAction         one step; the right action is -s, the reward minus the squared distance from it
+TwoStepCredit       two steps; the second one's reward is that of the first action
+Counter             the observation and the reward are the number of steps; truncated after 7
+Terminator          the same, terminated after 5
+Unbounded           two actions without bounds
+Discrete            discrete actions, which are not supported
 """
 
 import gymnasium as gym
@@ -54,7 +47,7 @@ class MatchAction(Probe):
 
 
 class TwoStepCredit(Probe):
-    """Observes (s, 0), then (0, 1); the second reward is -(a + s)^2 of the first step."""
+    """Observes (s, 0), then (0, 1)."""
 
     observation_space = Box(-1, 1, (2,))
 

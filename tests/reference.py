@@ -3,17 +3,16 @@
 The tests hold the training scripts equal to `eager_loss` and `eager_update`; `sweeps/speed.py` compares the speed of
 the scripts with that of this file's command:
 
-    python tests/reference.py --algorithm refineppo --env-id HalfCheetah-v5 --total-timesteps 20480 --csv returns.csv
+    python tests/reference.py --algorithm refineppo --env-id HalfCheetah-v5 --total-timesteps 20480
 
 Every environment has the usual stack of wrappers, as in the well-known scripts, but an episode's last step is also
 the next one's reset (SAME_STEP): the default of gymnasium 1 puts one fake transition per episode into the batch. At
-one environment this is the very algorithm of the training scripts. With several, each has statistics of its own here,
-where the scripts share them: the same speed, but it learns worse, since one policy then sees differently scaled states.
+one environment this is the very algorithm of the training scripts. With several, each has statistics of its own, where
+the scripts share them: the same speed, but one policy sees differently scaled states, and learns worse.
 """
 
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import gymnasium as gym
@@ -26,92 +25,62 @@ from torch.distributions import Normal
 
 @dataclass
 class Args:
+    """Flags as those of the training scripts, whose --help explains them."""
+
     algorithm: Literal["ppo", "refineppo"] = "ppo"
-    """PPO, or PPO with a refined action mean"""
     env_id: str = "HalfCheetah-v5"
-    """Gymnasium id of the task"""
     total_timesteps: int = 1_000_000
-    """environment steps to train for"""
     seed: int = 1
-    """seed of everything random"""
-    csv: str | None = None
-    """file for the episodes' returns, `global_step,episodic_return`"""
-    cuda: bool = False
-    """act and update on the GPU"""
+    cuda: bool = False  # act there too
     refinement_depth: int = 4
-    """K, of refineppo"""
     refinement_schedule: Literal["average", "uniform", "inverse"] = "average"
-    """the step sizes c_k, of refineppo"""
     num_envs: int = 1
-    """environments stepped together"""
     num_steps: int = 2048
-    """steps per environment in one rollout"""
     num_minibatches: int = 32
-    """minibatches into which a rollout is split"""
     update_epochs: int = 10
-    """passes over each rollout"""
     learning_rate: float = 3e-4
-    """Adam's step size, annealed to zero"""
     gamma: float = 0.99
-    """discount factor"""
     gae_lambda: float = 0.95
-    """lambda of the generalized advantage estimate"""
     clip_coef: float = 0.2
-    """half width of the clipping range"""
     norm_adv: bool = True
-    """normalise the advantages of each minibatch"""
     clip_vloss: bool = True
-    """clip the value's change in the value loss"""
     ent_coef: float = 0.0
-    """weight of the entropy bonus"""
     vf_coef: float = 0.5
-    """weight of the value loss"""
     max_grad_norm: float = 0.5
-    """largest norm of the whole gradient"""
 
 
 def mlp(sizes: list[int], output_gain: float) -> nn.Sequential:
     """A tanh network with orthogonal weights and zero biases."""
-    modules = []
-    for i, (n_in, n_out) in enumerate(zip(sizes, sizes[1:])):
-        is_output = i == len(sizes) - 2
-        linear = nn.Linear(n_in, n_out)
-        nn.init.orthogonal_(linear.weight, output_gain if is_output else 2**0.5)
-        nn.init.zeros_(linear.bias)
-        modules += [linear] if is_output else [linear, nn.Tanh()]
-    return nn.Sequential(*modules)
+    layers = [nn.Linear(*shape) for shape in zip(sizes, sizes[1:])]
+    for layer in layers:
+        nn.init.orthogonal_(layer.weight, output_gain if layer is layers[-1] else 2**0.5)
+        nn.init.zeros_(layer.bias)
+    return nn.Sequential(*(module for layer in layers for module in (layer, nn.Tanh())))[:-1]
 
 
 class Agent(nn.Module):
     """The Gaussian policy and the value function; K = None is plain PPO."""
 
-    def __init__(
-        self,
-        obs_dim: int,
-        action_dim: int,
-        K: int | None,
-        schedule: str,
-        actor_hidden=(128, 128),
-        critic_hidden=(64, 64),
-    ):
+    def __init__(self, obs_dim, action_dim, K, schedule, actor_hidden=(128, 128), critic_hidden=(64, 64)):
         super().__init__()
         self.K, self.schedule, self.action_dim = K, schedule, action_dim
         self.actor = mlp([obs_dim if K is None else obs_dim + action_dim, *actor_hidden, action_dim], 0.01)
         self.critic = mlp([obs_dim, *critic_hidden, 1], 1.0)
         self.log_std = nn.Parameter(torch.zeros(action_dim))
 
-    def mean(self, obs: torch.Tensor) -> torch.Tensor:
-        """The action mean (..., action_dim): f(s), or m_K from m_0 = 0 and m_k = m_{k-1} + c_k f([s; m_{k-1}])."""
+    def proposals(self, obs: torch.Tensor) -> list[torch.Tensor]:
+        """m_k = m_{k-1} + c_k f([s; m_{k-1}]) from m_0 = 0: m_1, ..., m_K, each (n, action_dim); of PPO only f(s)."""
         if self.K is None:
-            return self.actor(obs)
-        m = obs.new_zeros(*obs.shape[:-1], self.action_dim)
+            return [self.actor(obs)]
+        m, all_m = obs.new_zeros(len(obs), self.action_dim), []
         for k in range(1, self.K + 1):
             c = {"average": 1 / self.K, "uniform": 1.0, "inverse": 1 / k}[self.schedule]
             m = m + c * self.actor(torch.cat([obs, m], dim=-1))
-        return m
+            all_m.append(m)
+        return all_m
 
     def policy(self, obs: torch.Tensor) -> Normal:
-        return Normal(self.mean(obs), self.log_std.exp())
+        return Normal(self.proposals(obs)[-1], self.log_std.exp())
 
     def value(self, obs: torch.Tensor) -> torch.Tensor:
         return self.critic(obs).squeeze(-1)
@@ -167,8 +136,8 @@ def make_env(env_id: str, gamma: float) -> gym.Env:
     return gym.wrappers.TransformReward(env, lambda reward: np.clip(reward, -10, 10))
 
 
-def train(args: Args) -> tuple[list[tuple[int, float]], float]:
-    """Train; return the (global step, raw return) of every episode, and the steps per second."""
+def train(args: Args) -> tuple[list[float], float]:
+    """Train; return the raw return of every episode, and the steps per second."""
     torch.manual_seed(args.seed)
     device = torch.device("cuda" if args.cuda else "cpu")
     makers = [lambda: make_env(args.env_id, args.gamma)] * args.num_envs
@@ -181,7 +150,7 @@ def train(args: Args) -> tuple[list[tuple[int, float]], float]:
     shape = args.num_steps, args.num_envs
     all_obs, actions = torch.zeros(*shape, obs_dim, device=device), torch.zeros(*shape, action_dim, device=device)
     logprobs, rewards, ends, values = (torch.zeros(shape, device=device) for _ in range(4))
-    batch_size, episodes, step = args.num_envs * args.num_steps, [], 0
+    batch_size, returns = args.num_envs * args.num_steps, []
     obs, _ = envs.reset(seed=args.seed)
     start = time.time()
     iterations = args.total_timesteps // batch_size
@@ -198,10 +167,9 @@ def train(args: Args) -> tuple[list[tuple[int, float]], float]:
             obs, reward, terminated, truncated, infos = envs.step(actions[t].cpu().numpy())
             rewards[t] = torch.as_tensor(reward)
             ends[t] = torch.as_tensor(terminated | truncated)
-            step += args.num_envs
             if "final_info" in infos:
                 episode = infos["final_info"]["episode"]
-                episodes += [(step, float(r)) for r, ended in zip(episode["r"], episode["_r"]) if ended]
+                returns += episode["r"][episode["_r"]].tolist()
 
         with torch.no_grad():
             next_value = agent.value(torch.as_tensor(obs, dtype=torch.float32, device=device))
@@ -215,16 +183,13 @@ def train(args: Args) -> tuple[list[tuple[int, float]], float]:
         for _ in range(args.update_epochs):
             for index in torch.randperm(batch_size, device=device).split(batch_size // args.num_minibatches):
                 eager_update(agent, optimizer, args, *(x[index] for x in batch))
-    return episodes, step / (time.time() - start)
+    return returns, iterations * batch_size / (time.time() - start)
 
 
 if __name__ == "__main__":
     args = tyro.cli(Args, description=__doc__)
     torch.set_num_threads(1)
-    episodes, sps = train(args)
-    if args.csv:
-        rows = [f"{step},{episodic_return}\n" for step, episodic_return in episodes]
-        Path(args.csv).write_text("".join(["global_step,episodic_return\n", *rows]))
-    if episodes:
-        print(f"mean return of the last 10 episodes: {np.mean([r for _, r in episodes[-10:]]):.1f}")
+    returns, sps = train(args)
+    if returns:
+        print(f"mean return of the last 10 episodes: {np.mean(returns[-10:]):.1f}")
     print(f"{sps:.0f} steps/s")

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from conftest import ROOT, run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tensorboard.backend.event_processing.plugin_event_multiplexer import EventMultiplexer
 from test_commands import read_json
 
 wandb = pytest.importorskip("wandb")
@@ -24,7 +23,7 @@ SCRIPT = "refineppo_continuous.py"
 FLAGS = """
     --env-id Pendulum-v1 --num-envs 2 --num-steps 256 --num-minibatches 4 --update-epochs 1 --total-timesteps 20480
     --eval-interval 1024 --eval-episodes 2 --final-eval-episodes 2 --actor-hidden 16 --critic-hidden 16 --no-compile
-    --run-dir runs/one
+    --run-dir runs/one --resume
 """.split()
 
 
@@ -33,7 +32,7 @@ def records(path: Path):
     data, at, record = path.read_bytes(), 7, b""
     while at + 7 <= len(data):
         left = -at % 32768
-        if left < 7 and left:  # no room for a header in this block
+        if 0 < left < 7:  # no room for a header in this block
             at += left
             continue
         length, kind = int.from_bytes(data[at + 4 : at + 6], "little"), data[at + 6]
@@ -43,35 +42,40 @@ def records(path: Path):
             yield wandb.proto.wandb_internal_pb2.Record.FromString(record)
 
 
-def tracked(folder: Path) -> tuple[set[str], Counter, list[int]]:
-    """The ids of W&B's runs, how often each (tag, step, value) was logged, and the exit codes."""
-    ids, scalars, codes = set(), Counter(), []
+def in_wandb(folder: Path) -> tuple[set[str], list[int], Counter]:
+    """The ids of W&B's runs, their exit codes, and how often each (tag, step, value) was logged."""
+    ids, codes, scalars = set(), [], Counter()
     for path in sorted(folder.glob("wandb/offline-run-*/*.wandb")):
         for record in records(path):
-            if record.WhichOneof("record_type") == "run":
+            if record.HasField("run"):
                 ids.add(record.run.run_id)
-            if record.WhichOneof("record_type") == "exit":
+            if record.HasField("exit"):
                 codes.append(record.exit.exit_code)
             row = {item.key or item.nested_key[0]: json.loads(item.value_json) for item in record.history.item}
             scalars.update((tag, row["global_step"], np.float32(x).item()) for tag, x in row.items() if "/" in tag)
-    return ids, scalars, codes
+    return ids, codes, scalars
 
 
-def in_tensorboard(run_dir: Path) -> Counter:
-    events = EventAccumulator(str(run_dir), size_guidance={"scalars": 0}).Reload()
+def in_tensorboard(folder: Path) -> Counter:
+    events = EventAccumulator(str(folder / "runs/one"), size_guidance={"scalars": 0}).Reload()
     return Counter((tag, e.step, e.value) for tag in events.Tags()["scalars"] for e in events.Scalars(tag))
 
 
 def start(folder: Path, *flags) -> subprocess.Popen:
-    """A training, after its second evaluation."""
-    command = [sys.executable, str(ROOT / SCRIPT), *FLAGS, *flags]
-    with (folder / "out").open("w") as out:
-        process = subprocess.Popen(command, cwd=folder, stdout=out, stderr=subprocess.STDOUT)
-    deadline = time.monotonic() + 300
-    while (folder / "out").read_text().count("evaluation return") < 2:
-        assert process.poll() is None and time.monotonic() < deadline, (folder / "out").read_text()
+    """A training, after two evaluations."""
+    out, deadline = folder / "out", time.monotonic() + 300
+    with out.open("w") as file:
+        command = [sys.executable, ROOT / SCRIPT, *FLAGS, *flags]
+        process = subprocess.Popen(command, cwd=folder, stdout=file, stderr=subprocess.STDOUT)
+    while out.read_text().count("evaluation return") < 2:
+        assert process.poll() is None and time.monotonic() < deadline, out.read_text()
         time.sleep(0.02)
     return process
+
+
+def stop(process: subprocess.Popen):
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(120) == 75
 
 
 @pytest.fixture(autouse=True)
@@ -83,32 +87,21 @@ def offline(monkeypatch, tmp_path):
 
 
 @pytest.mark.slow
-def test_every_number_arrives_once_also_after_a_stop(tmp_path):
-    process = start(tmp_path, "--track")
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(120) == 75
-    resumed = run(SCRIPT, *FLAGS, "--track", "--resume", cwd=tmp_path)
-    assert resumed.returncode == 0, resumed.stderr
-    ids, scalars, codes = tracked(tmp_path)
+def test_every_number_arrives_once(tmp_path):
+    """Of a run that is tracked from its first resume on, and over its second one."""
+    stop(start(tmp_path))
+    assert not (tmp_path / "wandb").exists()
+    before = in_tensorboard(tmp_path)
+    stop(start(tmp_path, "--track"))
+    done = run(SCRIPT, *FLAGS, "--track", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    ids, codes, scalars = in_wandb(tmp_path)
     assert len(ids) == 1 and codes == [1, 0]
-    assert scalars == in_tensorboard(tmp_path / "runs" / "one")
-    counts = Counter(tag for tag, _, _ in scalars.elements())
+    assert before and scalars == in_tensorboard(tmp_path) - before
+    counts = Counter(tag for tag, _, _ in in_tensorboard(tmp_path).elements())
     assert counts["charts/episodic_return"] == 102  # 10240 steps of two environments, in episodes of 200
     assert counts["eval/return_mean"] == 20 and counts["losses/value_loss"] == 40 and counts["final/last_mean"] == 1
-    shown = EventMultiplexer()
-    shown.AddRunsFromDirectory(str(tmp_path))
-    assert list(shown.Runs()) == ["runs/one"]
-
-
-@pytest.mark.slow
-def test_tracked_from_a_resume_on(tmp_path):
-    process = start(tmp_path)
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(120) == 75 and not (tmp_path / "wandb").exists()
-    before = in_tensorboard(tmp_path / "runs" / "one")
-    assert run(SCRIPT, *FLAGS, "--track", "--resume", cwd=tmp_path).returncode == 0
-    _, scalars, _ = tracked(tmp_path)
-    assert before and scalars == in_tensorboard(tmp_path / "runs" / "one") - before
+    assert {path.parent for path in tmp_path.rglob("*tfevents*")} == {tmp_path / "runs/one"}
 
 
 def test_no_key(tmp_path):
@@ -125,4 +118,4 @@ def test_training_outlives_wandb(tmp_path):
     subprocess.run(["pkill", "-KILL", "-P", str(process.pid), "wandb-core"], check=True)
     assert process.wait(120) == 0
     assert (tmp_path / "out").read_text().count("warning: W&B failed") == 1
-    assert read_json(tmp_path / "runs" / "one" / "result.json")["last"]["global_step"] == 20480
+    assert read_json(tmp_path / "runs/one/result.json")["last"]["global_step"] == 20480
