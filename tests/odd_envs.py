@@ -1,7 +1,7 @@
 """Tasks with one odd behaviour each, of kinds that people bring; use them as `odd_envs:NAME-v0`.
 
 `Line` is sound. What the others differ in is said by their docstrings; those under "Twins" mean the same as Line, so
-that they must train to the very same numbers. Episodes have 40 steps, but those of the tasks under "Without end".
+that they must train to the very same numbers. Episodes have 40 steps.
 """
 
 import os
@@ -12,11 +12,11 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
-from gymnasium.spaces import Box, Dict, Tuple
+from gymnasium.spaces import Box, Dict
 
 
 class Line(gym.Env):
-    """A point x on a line in steps of 1/16, which float16 holds exactly; reward -x^2; starts at a whole number."""
+    """A point x on a line in steps of 1/16; reward -x^2; starts at a whole number."""
 
     observation_space = Box(-np.inf, np.inf, (2,), float)
     action_space = Box(-1, 1, (1,), np.float32)
@@ -44,28 +44,19 @@ class Line(gym.Env):
 # --- Twins ------------------------------------------------------------------------------------------------------------
 
 
-class WholeFirst(Line):
-    """The first observation is of whole numbers, the others are not."""
+class Lists(Line):
+    """Observations are lists, the first one of whole numbers."""
 
-    def reset(self, **kwargs):
-        obs, info = super().reset(**kwargs)
-        return obs.astype(int), info
-
-
-class HalfPrecision(Line):
-    observation_space = Box(-np.inf, np.inf, (2,), np.float16)
-
-    def look(self):
-        return super().look().astype(np.float16)
-
-
-class AsList(Line):
     def look(self):
         return super().look().tolist()
 
+    def reset(self, **kwargs):
+        obs, info = super().reset(**kwargs)
+        return [int(x) for x in obs], info
 
-class OneBuffer(Line):
-    """Every observation is the same array, into which the task goes on writing."""
+
+class Overwrites(Line):
+    """Every observation is the same array, into which the task goes on writing, as into the actions."""
 
     def look(self):
         self.buffer = getattr(self, "buffer", np.empty(2))
@@ -74,7 +65,9 @@ class OneBuffer(Line):
 
     def step(self, action):
         self.buffer[:] = 1e6
-        return super().step(action)
+        outcome = super().step(action)
+        action *= 0.5
+        return outcome
 
 
 class ObsInDict(Line):
@@ -85,13 +78,6 @@ class ObsInDict(Line):
         return {"time": np.array([[t]]), "place": np.array([x])}
 
 
-class ObsInTuple(Line):
-    observation_space = Tuple([Box(-np.inf, np.inf, (1,), float)] * 2)
-
-    def look(self):
-        return tuple(super().look().reshape(2, 1))
-
-
 class ObsInGrid(Line):
     observation_space = Box(-np.inf, np.inf, (2, 1), float)
 
@@ -99,39 +85,12 @@ class ObsInGrid(Line):
         return super().look().reshape(2, 1)
 
 
-class RewardArray(Line):
-    def step(self, action):
-        obs, reward, *rest = super().step(action)
-        return obs, np.array([reward]), *rest
-
-
-class RewardScalarArray(Line):
-    def step(self, action):
-        obs, reward, *rest = super().step(action)
-        return obs, np.array(reward, np.float32), *rest  # exact in float32
-
-
-class TerminatedArray(Line):
-    def step(self, action):
-        obs, reward, *_ = super().step(action)
-        return obs, reward, np.array([False]), np.bool_(False), {}
-
-
-class TruncatedArray(Line):
-    """Has its time limit itself."""
+class Arrays(Line):
+    """Rewards and ends are arrays; has its time limit itself."""
 
     def step(self, action):
         obs, reward, *_ = super().step(action)
-        return obs, reward, 0, np.array([self.t == 40]), {}
-
-
-class ActionInPlace(Line):
-    """Changes the array that it is given."""
-
-    def step(self, action):
-        outcome = super().step(action)
-        action *= 0.5
-        return outcome
+        return obs, np.array([reward], np.float32), np.array([False]), np.array([self.t == 40]), {}  # exact in float32
 
 
 class StrictAction(Line):
@@ -191,22 +150,6 @@ class ShortObs(Line):
         return super().look()[:1]
 
 
-class ColumnObs(Line):
-    def look(self):
-        return super().look().reshape(2, 1)
-
-
-class ObsChangesShape(Line):
-    """Sound until its 60th step in an environment's life."""
-
-    steps = 0
-
-    def step(self, action):
-        self.steps += 1
-        obs, *rest = super().step(action)
-        return obs if self.steps < 60 else obs[:1], *rest
-
-
 class TwoRewards(Line):
     def step(self, action):
         obs, reward, *rest = super().step(action)
@@ -261,11 +204,6 @@ class Mistake(Line):
         self.gain = {"mass": 1.0}["gain"]
 
 
-class MistakeInReset(Line):
-    def reset(self, **kwargs):
-        return self.start_again()
-
-
 class MistakeInStep(Line):
     def step(self, action):
         return self.t / 0
@@ -317,21 +255,26 @@ class Longer(Level):
         return obs, reward, self.t > 4 + 2 * self.level, False, {}
 
 
+# --- What fails or ends, as the environment variable ODD says ---------------------------------------------------------
+
+
 class Exits(Line):
-    """Ends the program, with the code for success, in the way that ODD says: in step or in reset."""
+    """Ends the program, with the code for success, in step or in reset."""
 
     steps = 0
 
     def step(self, action):
         Exits.steps += 1
-        if os.environ["ODD"] == "step" and Exits.steps > 300:
-            raise SystemExit(0)
+        self.exit_in("step")
         return super().step(action)
 
     def reset(self, **kwargs):
-        if os.environ["ODD"] == "reset" and Exits.steps > 300:
-            raise SystemExit(0)
+        self.exit_in("reset")
         return super().reset(**kwargs)
+
+    def exit_in(self, where):
+        if os.environ["ODD"] == where and Exits.steps > 300:
+            raise SystemExit(0)
 
 
 class Opened(Line):
@@ -354,62 +297,32 @@ class Opened(Line):
 class OpenedWholeActions(Opened):
     """Is refused when it has been made."""
 
-    action_space = Box(0, 4, (1,), np.int64)
+    action_space = WholeActions.action_space
 
 
-class OpenedCrash(Opened):
-    """The 300th step of all fails."""
+class Faulty(Line):
+    """One observation or reward is bad in the episode, at the step and in the way that ODD names, as "seed step way".
 
-    steps = 0
-
-    def step(self, action):
-        OpenedCrash.steps += 1
-        if OpenedCrash.steps > 300:
-            raise RuntimeError("the simulator crashed")
-        return super().step(action)
-
-
-class OpenedNan(OpenedCrash):
-    def step(self, action):
-        try:
-            return super().step(action)
-        except RuntimeError:
-            return np.full(2, np.nan), 0.0, False, False, {}
-
-
-class Faulty(gym.Env):
-    """Random observations and rewards; one is bad in the episode, at the step and in the way that FAULT names.
-
-    FAULT is "seed step way"; step 0 is the first observation, and a way a crash, or a number and in what it is.
+    Step 0 is the first observation, and a way a crash, or a number and in what it is.
     """
 
-    observation_space = Box(-1, 1, (3,), float)
-    action_space = Box(-1, 1, (1,))
-
-    def __init__(self, render_mode=None, scale=1.0):
-        self.scale = scale
-
-    def outcome(self):
-        obs, reward = self.np_random.uniform(-1, 1, 3), self.scale * self.np_random.normal()
-        if self.steps == self.fault:
-            if self.way == "crash":
-                raise RuntimeError("the simulator crashed")
-            number, what = self.way.rsplit("-", 1)
-            if what == "obs":
-                obs[1] = float(number)
-            else:
-                reward = float(number)
-        return obs, reward
-
     def reset(self, seed=None, options=None):
-        super().reset(seed=seed)
-        fault_seed, step, self.way = os.environ.get("FAULT", "-1 0 none").split()
-        self.steps, self.fault = 0, int(step) if seed == int(fault_seed) else None
-        return self.outcome()[0], {}
+        obs, info = super().reset(seed=seed)
+        fault_seed, step, self.way = (os.environ.get("ODD") or "-1 0 none").split()
+        self.fault = int(step) if seed == int(fault_seed) else None
+        return self.spoilt(obs, 0.0)[0], info
 
     def step(self, action):
-        self.steps += 1
-        return *self.outcome(), False, False, {}
+        obs, reward, *rest = super().step(action)
+        return *self.spoilt(obs, reward), *rest
+
+    def spoilt(self, obs, reward):
+        if self.t != self.fault:
+            return obs, reward
+        if self.way == "crash":
+            raise RuntimeError("the simulator crashed")
+        number, what = self.way.rsplit("-", 1)
+        return (np.array([0, float(number)]), reward) if what == "obs" else (obs, float(number))
 
 
 class Unstable(HalfCheetahEnv):
@@ -428,19 +341,14 @@ class Unstable(HalfCheetahEnv):
         return super().step(action)
 
 
-# --- Without end ------------------------------------------------------------------------------------------------------
-
-
 class Goal(Line):
-    """Ends at a goal that nobody reaches."""
+    """Ends at a goal that nobody reaches, and has no time limit."""
 
     def step(self, action):
         obs, reward, *_ = super().step(action)
         return obs, reward, bool(self.x > 100), False, {}
 
 
-for task in (Line, *Line.__subclasses__(), *Opened.__subclasses__(), OpenedNan, TimeStampsInFloats, Longer, Faulty):
-    own_end = task in (Goal, TruncatedArray)
-    gym.register(f"{task.__name__}-v0", task, max_episode_steps=None if own_end else 40)
+for task in (Line, *Line.__subclasses__(), OpenedWholeActions, TimeStampsInFloats, Longer):
+    gym.register(f"{task.__name__}-v0", task, max_episode_steps=None if task in (Goal, Arrays) else 40)
 gym.register("Unstable-v0", Unstable, max_episode_steps=150)
-gym.register("Huge-v0", Faulty, max_episode_steps=40, kwargs={"scale": 1e30})

@@ -1,14 +1,15 @@
 """Runs that are killed, stopped or starved at an exact place, and all that a run leaves behind, made comparable."""
 
 import hashlib
+import itertools
 import json
 import multiprocessing
 import os
 import runpy
 import signal
 import sys
+import tempfile
 import time
-from collections import Counter
 from functools import cache
 from pathlib import Path
 
@@ -16,9 +17,6 @@ import torch
 import torch._inductor  # seconds that every fork would spend again
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-ROOT = Path(__file__).parent.parent
-
-SCRIPTS = "ppo_continuous.py", "refineppo_continuous.py"
 TASKS = (
     "Ant-v5 HalfCheetah-v5 Hopper-v5 Walker2d-v5 Swimmer-v5 Pusher-v5 Reacher-v5 HumanoidStandup-v5 Humanoid-v5 "
     "Pendulum-v1 MountainCarContinuous-v0 LunarLanderContinuous-v3 BipedalWalker-v3 BipedalWalkerHardcore-v3"
@@ -35,6 +33,7 @@ TINY = {
     "eval_episodes": 2,
     "final_eval_episodes": 2,
     "checkpoint_interval": 64,
+    "save_every": 192,
     "compile": False,
     "progress": False,
 }
@@ -51,6 +50,8 @@ def flags(run_dir: Path, *more: str, **settings) -> list:
 
 # --- Processes --------------------------------------------------------------------------------------------------------
 
+KILLED = -signal.SIGKILL  # the exit code
+
 
 def send(*signals: int):
     """An action: this process sends itself the signals, one after the other."""
@@ -63,74 +64,66 @@ def send(*signals: int):
     return action
 
 
-kill = send(signal.SIGKILL)
-
-
-def lines_with(script: str, piece: str) -> list[int]:
-    """The numbers of the script's lines that contain the piece of text."""
-    lines = (ROOT / script).read_text().splitlines()
-    numbers = [number for number, line in enumerate(lines, start=1) if piece in line]
-    assert numbers, f"no line of {script} contains {piece!r}"
-    return numbers
-
-
 class Run:
-    """`python SCRIPT FLAGS` in a fork of this process, which saves the seconds that importing torch takes.
+    """The script's command in a fork of this process, which saves the seconds that importing torch takes.
 
-    `action` is called at an exact place, where a clock would only hit the slow ones: with `at` = (piece of text, n)
-    before the script executes for the n-th time a line that contains the text (or has this number), with `after` =
-    (file name, n) when the n-th version of the file is in place. `before` is called first.
+    `action`, else SIGKILL, is called at an exact place, where a clock would only hit the slow ones: with `at` = (piece
+    of text, n) before the script executes for the n-th time a line that contains the text, with `after` = (file name,
+    n) when the n-th version of the file is in place. `before` is called first; `odd` tells odd_envs.py what to do.
     """
 
-    def __init__(self, script: str, words: list, log: Path, at=None, after=None, action=kill, before=None):
-        self.path, self.words, self.log = str(ROOT / script), [str(word) for word in words], log
-        self.after, self.action, self.before = after, action, before
-        if at:
-            piece, n = at
-            at = lines_with(script, piece) if isinstance(piece, str) else [piece], n
-        self.at = at
-        self.process = multiprocessing.get_context("fork").Process(target=self.child)
+    def __init__(self, script, words: list, **more):
+        self.path, self.words, self.log = script.__file__, [str(word) for word in words], tempfile.TemporaryFile()
+        self.process = multiprocessing.get_context("fork").Process(target=self.child, kwargs=more)
         self.process.start()
 
-    def child(self):
-        output = os.open(self.log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    def child(self, at=None, after=None, action=None, before=None, odd=""):
         for descriptor in (1, 2):
-            os.dup2(output, descriptor)
-        sys.stdout, sys.stderr = open(1, "w"), open(2, "w")
-        sys.argv = [self.path, *self.words]
-        if self.before:
-            self.before()
-        if self.after:
-            os.replace = self.replacing(os.replace, *self.after)
-        if self.at:
-            (lines, n), executed = self.at, 0
-
-            def count(_):
-                nonlocal executed
-                executed += 1
-                if executed == n:
-                    self.action()
-
-            sys.settrace(tracer(self.path, count, frozenset(lines)))
+            os.dup2(self.log.fileno(), descriptor)
+        sys.stdout, sys.stderr, sys.argv = open(1, "w"), open(2, "w"), [self.path, *self.words]
+        os.environ["ODD"], action = str(odd), action or send(signal.SIGKILL)
+        if before:
+            before()
+        if at:
+            self.act_at(*at, action)
+        if after:
+            self.act_after(*after, action)
         runpy.run_path(self.path, run_name="__main__")
 
-    def replacing(self, replace, name: str, n: int):
-        """os.replace, which acts as soon as it has put the n-th version of the file in place."""
-        versions = 0
+    def act_at(self, piece: str, n: int, action):
+        source, executions = enumerate(Path(self.path).read_text().splitlines(), start=1), itertools.count(1)
+        lines = {number for number, line in source if piece in line}
+        assert lines, f"no line of {self.path} contains {piece!r}"
+
+        @cache  # most functions have none of the lines, and go on at full speed
+        def is_watched(code) -> bool:
+            return code.co_filename == self.path and any(line in lines for *_, line in code.co_lines())
+
+        def trace(frame, event, _):
+            if event == "call" and not is_watched(frame.f_code):
+                return None
+            if event == "line" and frame.f_lineno in lines and next(executions) == n:
+                action()
+            return trace
+
+        sys.settrace(trace)
+
+    def act_after(self, name: str, n: int, action):
+        replace, versions = os.replace, itertools.count(1)
 
         def replace_and_act(source, target):
-            nonlocal versions
             replace(source, target)
-            versions += Path(target).name == name
-            if Path(target).name == name and versions == n:
-                self.action()
+            if Path(target).name == name and next(versions) == n:
+                action()
 
-        return replace_and_act
+        os.replace = replace_and_act
 
     def wait(self, timeout=600) -> int:
         """The exit code; minus the signal's number if one killed the process."""
         self.process.join(timeout)
-        assert self.process.exitcode is not None, f"still running after {timeout} s"
+        if self.process.is_alive():
+            self.process.kill()  # else pytest would wait for it at its own end
+            raise TimeoutError(self.output())
         return self.process.exitcode
 
     def wait_until(self, condition, timeout=120):
@@ -140,62 +133,63 @@ class Run:
             time.sleep(0.01)
 
     def output(self) -> str:
-        return self.log.read_text(errors="replace") if self.log.exists() else ""
+        return os.pread(self.log.fileno(), 10**6, 0).decode(errors="replace")
 
 
-def tracer(path: str, seen, lines: frozenset = frozenset()):
-    """For sys.settrace: `seen(line number)` before every line, or every one of these lines, that the file executes."""
-
-    @cache  # most functions have none of the lines, and go on at full speed
-    def is_watched(code) -> bool:
-        return code.co_filename == path and (not lines or any(line in lines for *_, line in code.co_lines()))
-
-    def trace(frame, event, _):
-        if event == "call" and not is_watched(frame.f_code):
-            return None
-        if event == "line" and (not lines or frame.f_lineno in lines):
-            seen(frame.f_lineno)
-        return trace
-
-    return trace
-
-
-def finish(script: str, words: list, log: Path, **more) -> str:
-    """Run to the end; what it printed."""
-    run = Run(script, words, log, **more)
-    assert run.wait() == 0, run.output()
+def ends_with(code: int, script, words: list, timeout=600, **more) -> str:
+    """Run until it ends with this exit code; what it printed."""
+    run = Run(script, words, **more)
+    assert run.wait(timeout) == code, run.output()
     return run.output()
 
 
-def killed_after(versions: int, script: str, words: list, log: Path):
-    """Run until last.pt is there for this time, and kill it there."""
-    killed = Run(script, words, log, after=("last.pt", versions))
-    assert killed.wait() == -signal.SIGKILL, killed.output()
+def refusal(script, words: list) -> str:
+    """What is printed where the command is refused: one sentence, below a task's own traceback and warnings."""
+    printed = ends_with(2, script, words)
+    *above, sentence = printed.splitlines()
+    assert sentence.startswith(f"{script.__name__}.py: error: "), printed
+    assert not above or above[0].startswith(("warning: ", "Traceback")), printed
+    return printed
 
 
-def refusal(script: str, words: list, log: Path) -> str:
-    """The one sentence with which the command is refused, below a task's own traceback and warnings."""
-    refused = Run(script, words, log)
-    assert refused.wait() == 2, refused.output()
-    *above, sentence = refused.output().splitlines()
-    assert sentence.startswith(f"{script}: error: "), refused.output()
-    assert not above or above[0].startswith(("warning: ", "Traceback")), refused.output()
-    return sentence
+@cache
+def uninterrupted(script, *words) -> dict[str, str]:
+    """What a run with these flags leaves where nothing interrupts it."""
+    with tempfile.TemporaryDirectory() as folder:
+        ends_with(0, script, ["--run-dir", Path(folder, "run"), *words])
+        return outcome(Path(folder, "run"))
 
 
-def count_lines(script: str, words: list, log: Path) -> Counter:
-    """Run to the end; how often it executed each of the script's lines."""
-    counts, file = Counter(), log.with_suffix(".json")
+def finish_exactly(script, words: list, *now, **more) -> str:
+    """Continue the run to its end, with the flags `now` as well; what it printed.
 
-    def count(line):
-        counts[line] += 1
+    It must leave what `words`, which are its own `flags`, leave where nothing interrupts it.
+    """
+    printed = ends_with(0, script, [*words, *now], **more)
+    _, run_dir, *own = words
+    whole = uninterrupted(script, *(word for word in own if word != "--resume"))
+    assert differences(whole, outcome(run_dir)) == []
+    return printed
 
-    def before():
-        sys.settrace(tracer(str(ROOT / script), count))
-        multiprocessing.util.Finalize(None, lambda: file.write_text(json.dumps(counts)), exitpriority=0)
 
-    finish(script, words, log, before=before)
-    return Counter({int(line): n for line, n in json.loads(file.read_text()).items()})
+PLACES = {  # pieces of the scripts' lines, and how often a process may execute one before it is interrupted
+    "training = run.begin_or_resume()": 1,
+    "self.actions[i].append(": 100,
+    "torch.from_numpy(rollout.obs)": 2,
+    "update_function(agent.params": 20,
+    "add_scalar(": 40,
+    "lengths[i] += 1": 300,
+    "torch.save(state": 4,
+    "os.fsync(": 8,
+    "os.replace(": 8,
+}
+
+
+def interrupt(rng, script, words: list, signum=signal.SIGKILL, scale=1) -> Run:
+    """Start the run and interrupt it at a random place."""
+    place = rng.choice(list(PLACES))
+    n = int((scale * PLACES[place]) ** rng.random())  # as often among the first ten as among the first hundred
+    return Run(script, words, at=(place, n), action=send(signum))
 
 
 # --- What a run leaves behind -----------------------------------------------------------------------------------------
@@ -224,15 +218,11 @@ def outcome(run_dir: Path) -> dict[str, str]:
         found |= flatten(path.name, state)
     result = json.loads((run_dir / "result.json").read_text())
     del result["wall_time_s"], result["sps"]
-    return found | flatten("result.json", result) | tensorboard(run_dir)
-
-
-def tensorboard(run_dir: Path) -> dict[str, str]:
-    """Every scalar but charts/SPS, as TensorBoard shows them, and how often text and hyperparameters are there."""
     events = EventAccumulator(str(run_dir), size_guidance={"scalars": 0, "tensors": 0}).Reload()
-    tags = events.Tags()
-    found = {tag: str([(e.step, e.value) for e in events.Scalars(tag)]) for tag in tags["scalars"] if "SPS" not in tag}
-    return found | {tag: f"{len(events.Tensors(tag))} times" for tag in tags["tensors"]}
+    scalars = [tag for tag in events.Tags()["scalars"] if tag != "charts/SPS"]
+    found |= {tag: str([(event.step, event.value) for event in events.Scalars(tag)]) for tag in scalars}
+    found |= {tag: f"{len(events.Tensors(tag))} times" for tag in events.Tags()["tensors"]}
+    return found | flatten("result.json", result)
 
 
 def differences(one: dict, other: dict) -> list[str]:

@@ -3,7 +3,7 @@
     python tests/soak_resume.py --minutes 60 --seed 0
 
 Script, task, settings, the number of kills, their moments and signals are drawn anew every round. It stops at the first
-difference, keeps both run folders, and says where they are.
+difference, and keeps both run folders.
 """
 
 import argparse
@@ -15,34 +15,22 @@ import signal
 import sys
 import tempfile
 import time
-from collections import Counter
 from pathlib import Path
 
 sys.path[:0] = [str(Path(__file__).parent.parent), str(Path(__file__).parent)]
 
 import torch  # noqa: E402
-from resume_helpers import SCRIPTS, TASKS, Run, differences, finish, flags, outcome, send  # noqa: E402
+from resume_helpers import TASKS, Run, differences, ends_with, flags, interrupt, outcome  # noqa: E402
 
-import ppo_continuous  # noqa: E402, F401  (every run is a fork of this process and needs the same imports)
+import ppo_continuous  # noqa: E402
+import refineppo_continuous  # noqa: E402
 
-PLACES = {  # pieces of the scripts' lines, and how often a process may execute one before it is interrupted
-    "training = run.begin_or_resume()": 1,
-    "self.actions[i].append(": 2000,
-    "torch.from_numpy(rollout.obs)": 8,
-    "update_function(agent.params": 100,
-    "add_scalar(": 200,
-    "lengths[i] += 1": 2000,
-    "torch.save(state": 20,
-    "os.fsync(": 30,
-    "os.replace(": 30,
-}
 SIGNALS = (signal.SIGKILL,) * 6 + (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, signal.SIGHUP)
 
 
 def random_settings(rng: random.Random) -> dict:
     """A small run's settings; every choice is one that resume must not depend on."""
     num_envs, num_steps = rng.choice((1, 1, 2, 3, 8, 17)), rng.choice((32, 64, 96, 200))
-    iterations = rng.randint(4, 16)
     batch = num_envs * num_steps
     settings = {
         "env_id": rng.choice(TASKS),
@@ -50,35 +38,17 @@ def random_settings(rng: random.Random) -> dict:
         "num_envs": num_envs,
         "num_steps": num_steps,
         "num_minibatches": rng.choice((1, 4, 8)),
-        "total_timesteps": batch * iterations + rng.randrange(batch),
+        "total_timesteps": batch * rng.randint(4, 16) + rng.randrange(batch),
         "eval_interval": batch * rng.randint(2, 6),
         "checkpoint_interval": batch * rng.choice((1, 1, 2, 3)),
+        "save_every": batch * rng.choice((2, 100, 100)),
         "max_episode_steps": rng.choice((30, 100, 300)),
         "actor_hidden": rng.choice((16, 64)),
         "compile": rng.random() < 0.1,
+        "target_kl": rng.choice((0.01, 1e9, 1e9, 1e9)),
     }
     switches = "anneal_lr norm_adv clip_vloss bootstrap_truncated normalize_obs normalize_reward".split()
-    settings |= {switch: rng.random() < 0.5 for switch in switches}
-    settings |= {"target_kl": 0.01} if rng.random() < 0.2 else {}
-    return settings | ({"save_every": batch * 2} if rng.random() < 0.3 else {})
-
-
-def interrupt(rng: random.Random, script: str, words: list, log: Path, seconds: float) -> str:
-    """Start the run and interrupt it, by line or by the clock; the signal's name, or "end" if the run was faster."""
-    signum = rng.choice(SIGNALS)
-    if rng.random() < 0.5:
-        place = rng.choice(list(PLACES))
-        n = int(PLACES[place] ** rng.random())  # as often among the first ten as among the first thousand
-        run = Run(script, words, log, at=(place, n), action=send(signum))
-    else:
-        run = Run(script, words, log)
-        run.process.join(rng.uniform(0, seconds))
-        if run.process.is_alive():
-            os.kill(run.process.pid, signum)
-    code = run.wait(1200)
-    if code not in (0, 75, -signum):  # minus the signal: it was SIGKILL, or came before the handlers were in place
-        raise SystemExit(f"exit code {code} after {signum.name}:\n{run.output()}")
-    return signum.name if code else "end"
+    return settings | {switch: rng.random() < 0.5 for switch in switches}
 
 
 def main():
@@ -88,32 +58,32 @@ def main():
     options = parser.parse_args()
     torch.set_num_threads(1)
     logging.disable(logging.WARNING)  # TensorBoard tells of every purge
-    folder = Path(tempfile.mkdtemp(prefix="soak_resume_"))
-    end, rounds, interrupts = time.time() + 60 * options.minutes, 0, Counter()
+    end, rounds = time.time() + 60 * options.minutes, 0
     while time.time() < end:
-        rng = random.Random(f"{options.seed} {rounds}")
-        script, settings = rng.choice(SCRIPTS), random_settings(rng)
+        rng, folder = random.Random(f"{options.seed} {rounds}"), Path(tempfile.mkdtemp(prefix="soak_resume_"))
+        script, settings = rng.choice((ppo_continuous, refineppo_continuous)), random_settings(rng)
+        print(f"{rounds}: {script.__name__} {settings} in {folder}", flush=True)
         start = time.time()
-        finish(script, flags(folder / "whole", **settings), folder / "whole.log")
-        seconds, words, ends = time.time() - start, flags(folder / "killed", "--resume", **settings), []
+        ends_with(0, script, flags(folder / "whole", **settings), timeout=1200)
+        seconds, words = time.time() - start, flags(folder / "killed", "--resume", **settings)
         for _ in range(rng.randint(1, 10)):
-            ends.append(interrupt(rng, script, words, folder / "killed.log", seconds))
-            if ends[-1] == "end":
+            signum, by_line = rng.choice(SIGNALS), rng.random() < 0.5
+            run = interrupt(rng, script, words, signum, scale=10) if by_line else Run(script, words)
+            run.process.join(None if by_line else rng.uniform(0, seconds))
+            if run.process.is_alive():
+                os.kill(run.process.pid, signum)
+            code = run.wait(1200)
+            print(signum.name if code else "end", end=" ", flush=True)
+            # minus the signal: it was SIGKILL, or came before the handlers were in place
+            assert code in (0, 75, -signum), f"exit code {code}:\n{run.output()}"
+            if code == 0:
                 break
-        last = Run(script, words, folder / "killed.log")
-        if last.wait(1200):
-            raise SystemExit(f"{script} {settings} could not be continued:\n{last.output()}\nfolders kept: {folder}")
+        ends_with(0, script, words, timeout=1200)
         differing = differences(outcome(folder / "whole"), outcome(folder / "killed"))
-        verdict = f"DIFFERENT in {differing}" if differing else "same"
-        rounds, interrupts = rounds + 1, interrupts + Counter(ends)
-        details = f"{settings['num_envs']} x {settings['num_steps']}{', compiled' if settings['compile'] else ''}"
-        print(f"{rounds}: {script} {settings['env_id']} {details}: {' '.join(ends)}: {verdict}", flush=True)
-        if differing:
-            raise SystemExit(f"{settings}\nfolders kept: {folder}")
-        shutil.rmtree(folder / "whole")
-        shutil.rmtree(folder / "killed")
-    shutil.rmtree(folder)
-    print(f"{rounds} rounds, all the same after {dict(interrupts)}")
+        assert not differing, f"{differing}, in the folder above"
+        print("and the same", flush=True)
+        shutil.rmtree(folder)
+        rounds += 1
 
 
 if __name__ == "__main__":
