@@ -15,7 +15,7 @@ from unittest import mock
 import gymnasium as gym
 import pytest
 import torch
-from conftest import ROOT, imports, run
+from conftest import ROOT, imports, python, run
 from resume_helpers import TASKS
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
@@ -141,6 +141,27 @@ def test_what_a_longer_run_logs_keeps_and_prints(script, tmp_path, capsys):
         check_checkpoint(kept[f"step_{step}.pt"], script, "probe_envs:Counter-v0", step)
     call_main(script, *flags, "--run-dir", tmp_path / "quiet", "--no-progress")
     assert "evaluation" not in capsys.readouterr().out
+
+
+WITHOUT_POSIX = """
+import runpy, signal, sys
+sys.modules["fcntl"] = None  # `import fcntl` then raises ImportError
+for name in ("SIGUSR1", "SIGUSR2", "SIGHUP", "SIGQUIT"):
+    delattr(signal, name)
+del sys.argv[0]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ppo_continuous.py", "refineppo_continuous.py", "analysis_refinement.py"])
+def test_without_posix(name, tmp_path):
+    """As on Windows."""
+    trains = name != "analysis_refinement.py"
+    words = [*QUICK, "--env-id", "Pendulum-v1", "--run-dir", tmp_path] if trains else ["--help"]
+    done = python("-c", WITHOUT_POSIX, name, *words)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "result.json").exists() == trains
 
 
 @pytest.mark.slow

@@ -94,15 +94,6 @@ def test_a_closed_terminal_under_nohup_stops_nothing(script, tmp_path):
 
 
 @pytest.mark.slow
-def test_signals_that_a_system_lacks(script, tmp_path):
-    def as_on_windows():
-        for name in ("SIGUSR1", "SIGUSR2", "SIGHUP", "SIGQUIT"):
-            delattr(signal, name)
-
-    finish_exactly(script, flags(tmp_path / "run"), before=as_on_windows)
-
-
-@pytest.mark.slow
 def test_interrupt_while_compiling(script, tmp_path):
     """Ctrl-C reaches the C++ compiler as well, and its failure must not look like one of the machine."""
     cache = tmp_path / "cache"
