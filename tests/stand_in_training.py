@@ -44,32 +44,26 @@ class Args:
     eval_interval: int = 100_000
     eval_episodes: int = 10
     final_eval_episodes: int = 10
-    checkpoint_interval: int = 50_000
     progress: bool = True
-
-
-def refuse(sentence: str):
-    print(f"training.py: error: {sentence}", file=sys.stderr)
-    sys.exit(2)
 
 
 def main(args: Args):
     signals, run_dir = [], Path(args.run_dir)
     signal.signal(signal.SIGTERM, lambda *_: signals.append(1))
-    if args.env_id == "Unknown-v0":
-        refuse("cannot make the task Unknown-v0")
+    fault = json.loads(os.environ.get("FAULTS", "{}")).get(run_dir.parent.name)
     run_dir.mkdir(parents=True, exist_ok=True)
     try:
         fcntl.flock(os.open(run_dir, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        refuse(f"another process is at work in {run_dir}")
+        fault = "another process is at work"
+    if fault in ("another process is at work", "the flags are bad"):
+        print(f"training.py: error: {fault}", file=sys.stderr)
+        sys.exit(2)
     if (run_dir / "result.json").exists():
         sys.exit(0)
-    made, steps = run_dir / "steps.txt", int(os.environ.get("STEPS", 2))
-    fault = json.loads(os.environ.get("FAULTS", "{}")).get(run_dir.parent.name)
-    if fault == "refused":
-        refuse("the flags are bad")
-    for step in range(len(made.read_text().splitlines()) if made.exists() else 0, steps):
+    made = run_dir / "steps.txt"
+    made.touch()
+    for step in range(len(made.read_text().splitlines()), int(os.environ.get("STEPS", 2))):
         time.sleep(0.05)
         if step == 1 and (fault == "crashes" or fault == "crashes once" and not (run_dir / "crashed").exists()):
             (run_dir / "crashed").touch()

@@ -195,14 +195,18 @@ def test_delta_r2_and_its_checks_equal_closed_form_ridge(tmp_path):
 
 
 def test_jacobian_equals_finite_differences(tmp_path):
-    policy, rng = load_policy(save(tmp_path / "best.pt", "Hopper-v5")), np.random.default_rng(0)
-    obs, m, c, h = rng.normal(size=(7, 11)), rng.normal(size=(7, 3)), 0.7, 1e-6
+    """At m_{k-1} of the recorded states; its largest singular value is the table's."""
+    policy, h = load_policy(save(tmp_path / "best.pt", "Hopper-v5")), 1e-6
+    tables, _ = analyse(policy.path, flags="--sections dynamics --num-states 20")
+    table = tables["dynamics"].set_index(["quantity", "step"]).value["largest_singular_value"]
+    obs = states(policy, 20)[0].astype(float)
     weights = refineppo.layers({name: p.double() for name, p in policy.agent.params.items()}, "actor")
-    exact = analysis.step_jacobians(weights, torch.from_numpy(obs), torch.from_numpy(m), c)
-    assert exact.shape == (7, 3, 3)
-    for j in range(3):
-        plus, minus = (x + c * f(policy, obs, x) for x in (m + h * np.eye(3)[j], m - h * np.eye(3)[j]))
-        np.testing.assert_allclose(exact[:, :, j], (plus - minus) / (2 * h), rtol=1e-7, atol=1e-8)
+    for k, m in enumerate(proposals_of(policy, obs)[:-1], start=1):
+        exact = analysis.step_jacobians(weights, torch.from_numpy(obs), torch.from_numpy(m), 1 / 4).numpy()
+        for j in range(3):
+            plus, minus = (x + f(policy, obs, x) / 4 for x in (m + h * np.eye(3)[j], m - h * np.eye(3)[j]))
+            np.testing.assert_allclose(exact[:, :, j], (plus - minus) / (2 * h), rtol=1e-7, atol=1e-8)
+        assert table[k] == pytest.approx(np.median(np.linalg.norm(exact, 2, axis=(1, 2))), rel=1e-5)
 
 
 def test_dynamics_of_a_linear_field(tmp_path):
@@ -371,7 +375,7 @@ def test_adaptive_equals_plain_episodes(tmp_path):
     policy = load_policy(save(tmp_path / "best.pt"))
     tables, _ = analyse(policy.path, flags="--sections adaptive --episodes 2 --num-states 100")
     drops, widths = -np.diff(tables["adaptive"].steps_mean), np.diff(tables["adaptive"]["quantile"])
-    assert widths[drops.argmax()] == widths.min() < widths.max()  # where the mean steps lie far apart, it looks closer
+    assert widths[drops.argmax()] < np.median(widths)  # it looks closer where the mean steps lie far apart
     for row in tables["adaptive"].itertuples():
         used = []
 

@@ -184,11 +184,6 @@ def change(path: Path, **parts) -> Path:
     return path
 
 
-def torn(path: Path) -> Path:
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    return path
-
-
 def of_ppo(path: Path) -> Path:
     state = torch.load(path, weights_only=True)
     refineppo.save_checkpoint(path, state | {"args": asdict(ppo_continuous.Args(env_id="Reacher-v5"))})
@@ -207,9 +202,8 @@ BAD_INPUT = {  # what is done with a checkpoint -> what the refusal says
     "nan": (lambda path: [change(path, params={"log_std": NAN.expand(2)})], "not finite"),
     "nan in the statistics": (lambda path: [change(path, normalizer={"obs.mean": NAN.expand(10)})], "not finite"),
     "ppo": (lambda path: [of_ppo(path)], "not written by"),
-    "one step": (lambda path: [save(path, refinement_depth=1)], "K = 1"),
+    "one step, the second": (lambda path: other(path, refinement_depth=1), "K = 1"),
     "missing package": (lambda path: [change(path, args={"env_id": "no_such_module:Task-v0"})], "no_such_module"),
-    "second one torn": (lambda path: [path, torn(save(path.with_name("last.pt")))], "damaged"),
     "twice": (lambda path: [path, path.parent / "." / path.name], "twice"),
     "two tasks": (lambda path: other(path, "Pendulum-v1"), "same task"),
     "two depths": (lambda path: other(path, refinement_depth=3), "depth"),

@@ -14,10 +14,6 @@ RESULTS = ROOT / "sweeps/results"
 POLICIES = sorted(RESULTS.glob("policies/*.pt"))
 
 
-def test_there_are_policies():
-    assert POLICIES
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("path", POLICIES, ids=lambda path: path.stem)
 def test_a_kept_policy_returns_what_the_table_says(path):
