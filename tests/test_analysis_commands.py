@@ -15,6 +15,7 @@ import torch
 from conftest import run
 from test_analysis import save
 from test_commands import call_main
+from test_failures import Malicious
 
 import analysis_refinement as analysis
 import ppo_continuous
@@ -198,6 +199,7 @@ def other(path: Path, env_id="Reacher-v5", **flags) -> list[Path]:
 NAN = torch.tensor(float("nan"))
 BAD_INPUT = {  # what is done with a checkpoint -> what the refusal says
     "missing file": (lambda path: [path.with_name("no.pt")], "there is no checkpoint"),
+    "malicious": (lambda path: [torch.save({"args": Malicious()}, path) or path], "damaged"),
     "other shapes": (lambda path: [change(path, params={"log_std": torch.zeros(3)})], "does not fit"),
     "nan": (lambda path: [change(path, params={"log_std": NAN.expand(2)})], "not finite"),
     "nan in the statistics": (lambda path: [change(path, normalizer={"obs.mean": NAN.expand(10)})], "not finite"),
@@ -229,8 +231,9 @@ def refusal(capsys, *flags) -> tuple[str, str]:
 
 
 @pytest.mark.parametrize("case", BAD_INPUT)
-def test_bad_input_is_refused(case, tmp_path, capsys):
-    """Before any work, and without an output folder."""
+def test_bad_input_is_refused(case, tmp_path, capsys, monkeypatch):
+    """Before any work, without an output folder, and nothing in the file is executed."""
+    monkeypatch.chdir(tmp_path)
     make_flags, expected = BAD_INPUT[case]
     flags = make_flags(save(tmp_path / "in/best.pt"))
     out, err = refusal(capsys, "--out-dir", tmp_path / "out", "--checkpoint", *flags)
