@@ -2,11 +2,13 @@
 
 import ast
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # the tests themselves run in parallel
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored, and so inherited, where they run in the background
 ROOT = Path(__file__).parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 

@@ -402,7 +402,6 @@ def test_a_local_sweep_is_killed_stopped_and_continued(engine, tmp_path):
     command = [str(ROOT / "sweeps" / "run_local.sh"), "-j", "2", "jobs"]
     pid, terminal = pty.fork()
     if not pid:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # ignored where the tests run in the background
         os.chdir(tmp_path)
         os.execve(command[0], command, environment(tmp_path))
     run_dir = tmp_path / long
