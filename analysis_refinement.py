@@ -454,9 +454,9 @@ def analyse(policy: Policy, args: Args) -> dict[str, pd.DataFrame]:
         "training": lambda: {"training": training_rows(policy, obs, proposals, args.seed)},
     }
     tables, path = {}, {"checkpoint": str(policy.path)}
-    for section in sections:
-        for name, rows in sections[section]().items() if section in args.sections else ():
-            tables |= {name: pd.DataFrame([path | row for row in rows])} if rows else {}
+    for section, rows_of in sections.items():
+        if section in args.sections:
+            tables |= {name: pd.DataFrame([path | row for row in rows]) for name, rows in rows_of().items() if rows}
     return tables
 
 

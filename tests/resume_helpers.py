@@ -15,6 +15,7 @@ from pathlib import Path
 
 import torch
 import torch._inductor  # seconds that every fork would spend again
+from flags import words
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 TASKS = (
@@ -41,11 +42,7 @@ TINY = {
 
 def flags(run_dir: Path, *more: str, **settings) -> list:
     """A tiny run's flags: num_envs=2, compile=False as --num-envs 2 --no-compile."""
-    words = ["--run-dir", run_dir, *more]
-    for name, value in (TINY | settings).items():
-        name = name.replace("_", "-")
-        words += [f"--{name}" if value else f"--no-{name}"] if isinstance(value, bool) else [f"--{name}", value]
-    return words
+    return ["--run-dir", run_dir, *more, *words(TINY | settings)]
 
 
 # --- Processes --------------------------------------------------------------------------------------------------------

@@ -17,7 +17,8 @@ import tempfile
 import time
 from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).parent.parent), str(Path(__file__).parent)]
+ROOT = Path(__file__).parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "sweeps")]
 
 import torch  # noqa: E402
 from resume_helpers import TASKS, Run, differences, ends_with, flags, interrupt, outcome  # noqa: E402

@@ -20,15 +20,13 @@ import pytest
 import torch
 import tyro
 from conftest import ROOT
+from resume_helpers import TASKS
 
 import ppo_continuous
 import refineppo_continuous
 from sweeps.toy_env import phi, psi
 
-MUJOCO = "Ant HalfCheetah Hopper Walker2d Swimmer Pusher Reacher HumanoidStandup Humanoid"
-MUJOCO = [f"{name}-v5" for name in MUJOCO.split()]
-TASKS = "Pendulum-v1 MountainCarContinuous-v0 LunarLanderContinuous-v3 BipedalWalker-v3 BipedalWalkerHardcore-v3"
-TASKS = [*MUJOCO, *TASKS.split()]
+MUJOCO = [task for task in TASKS if task.endswith("-v5")]
 GENERATORS = "benchmark.sh depth.sh schedule.sh controls.sh learning_rates.sh toy.sh".split()
 OWN = "SEEDS STEPS RUNS_DIR SETTINGS FLAGS DONE".split()
 TINY = "--no-compile --num-steps 32 --num-minibatches 2 --update-epochs 1 --actor-hidden 16 --critic-hidden 16"
