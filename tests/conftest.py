@@ -10,7 +10,8 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # the tests themselves run in parallel
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored, and so inherited, where they run in the background
 ROOT = Path(__file__).parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+PATHS = [str(ROOT), str(ROOT / "tests"), str(ROOT / "sweeps")]
+sys.path[:0] = PATHS
 
 import pytest  # noqa: E402
 import torch  # noqa: E402
@@ -29,8 +30,8 @@ def script(request):
 
 
 def python(*words, cwd=ROOT, timeout=600, **env) -> subprocess.CompletedProcess:
-    """`python WORDS` in a process of its own; tests/ can be imported there, for `module:Env-v0` ids."""
-    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])} | env
+    """`python WORDS` in a process of its own, which imports what the tests do, for `module:Env-v0` ids."""
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(PATHS)} | env
     command = [sys.executable, *map(str, words)]
     return subprocess.run(command, cwd=cwd, timeout=timeout, text=True, capture_output=True, env=env)
 
