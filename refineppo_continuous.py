@@ -1193,12 +1193,13 @@ def describe_machine() -> dict:
     """Versions, commit and hardware: what the numbers of a run may depend on beside its flags."""
     git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
     commit = subprocess.run(git, capture_output=True, text=True).stdout.strip() if shutil.which("git") else ""
-    cpu = Path("/proc/cpuinfo").read_text() if sys.platform == "linux" else ""
+    info = Path("/proc/cpuinfo").read_text() if sys.platform == "linux" else ""
+    cpu = next((line.split(": ")[1] for line in info.splitlines() if "model name" in line), platform.processor())
     versions = {name: version(name) for name in ("torch", "numpy", "gymnasium", "mujoco", "box2d")}
     return {
         "versions": {"python": platform.python_version(), **versions},
         "git_commit": commit or None,
-        "cpu": next((line.split(": ")[1] for line in cpu.splitlines() if "model name" in line), platform.processor()),
+        "cpu": f"{cpu} ({torch.backends.cpu.get_cpu_capability()})",  # generations of one name may round differently
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }
 

@@ -17,7 +17,10 @@ POLICIES = sorted(RESULTS.glob("policies/*.pt"))
 @pytest.mark.slow
 @pytest.mark.parametrize("path", POLICIES, ids=lambda path: path.stem)
 def test_a_kept_policy_returns_what_the_table_says(path):
-    """Digit for digit with the table's processor and versions; elsewhere its mean is within the spread of episodes."""
+    """Digit for digit with the table's processor and versions; elsewhere most episodes are within the spread of those.
+
+    The median, since in one episode of many a policy may fall by how a number is rounded.
+    """
     runs = pd.read_csv(RESULTS / "benchmark/runs.csv", dtype=str, keep_default_na=False).set_index("run")
     checkpoint = load_checkpoint(path)
     args = Args(**checkpoint["args"])
@@ -28,7 +31,9 @@ def test_a_kept_policy_returns_what_the_table_says(path):
     machine = describe_machine()
     versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
     kernels = {library.get("architecture") for library in threadpool_info()} - {None}
-    if (machine["cpu"], versions, kernels) == (row.cpu, row.versions, {"SkylakeX"}):  # OpenBLAS's, where it was trained
+    trained_here = machine["cpu"].startswith(row.cpu) and kernels == {"SkylakeX"}  # OpenBLAS's, with AVX-512
+    if trained_here and versions == row.versions:
         assert " ".join(map(repr, returns.tolist())) == row.best_returns
     else:
-        assert abs(np.mean(returns) - float(row.best_mean)) <= 3 * float(row.best_std)
+        then = [float(x) for x in row.best_returns.split()]
+        assert abs(np.median(returns) - np.median(then)) <= 3 * float(row.best_std)
