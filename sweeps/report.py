@@ -648,9 +648,8 @@ def cost(e: Experiment, report: Report):
         row = {"method": method, "runs": len(runs), "steps/s: median (range)": Median.of([run.sps for run in runs])}
         rows.append(row | {"hours": sum(run.wall_time_s for run in runs) / 3600})
     report.table("cost", rows)
-    everything = [run for runs in methods.values() for run in runs]
     for name in ("task", "cpu", "gpu", "git_commit", "versions"):
-        report.facts[name] = sorted({getattr(run, name) for run in everything} - {""})
+        report.facts[name] = sorted({getattr(run, name) for runs in methods.values() for run in runs} - {""})
 
 
 def missing(e: Experiment) -> list[str]:
@@ -714,7 +713,8 @@ def check_folder(folder: Path, found: dict[str, Run]):
     if (folder / "runs.csv").exists():
         before = merge([*found.values(), *read_source(folder / "runs.csv", print)])
         if lost := [name for name in before if name not in found]:
-            refuse(f"{folder} has runs that no source has ({', '.join(lost)}); name it as a source too to keep them")
+            some = ", ".join(lost[:3] + ["..."] * (len(lost) > 3))
+            refuse(f"{folder} has runs that no source has ({some}); name it as a source too to keep them")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()

@@ -585,7 +585,7 @@ BAD_INPUT = {
     "runs --depth 0": "--depth must be at least 1",
     "runs --out-dir mine": "mine/report.md was made by no report",
     "runs --out-dir runs/one": "runs/one/evaluations.csv was made by no report",
-    "runs --out-dir earlier": "earlier has runs that no source has (two)",
+    "runs --out-dir earlier": "earlier has runs that no source has (1, 2, 3, ...); name it",
     "runs --out-dir mine/report.md": "cannot write to",
 }
 
@@ -599,7 +599,8 @@ def test_bad_input_is_refused(flags, sentence, tmp_path, make_report, capsys, mo
     (tmp_path / "mine/report.md").write_text("mine")
     (tmp_path / "torn/config.json").write_text("{")
     (tmp_path / "torn/result.json").touch()
-    make_run(tmp_path / "more/two", "Hopper-v5", 2)
+    for seed in (1, 2, 3, 4):
+        make_run(tmp_path / f"more/{seed}", "Hopper-v5", seed)
     make_report(tmp_path / "more", "--out-dir", tmp_path / "earlier")
     make_run(tmp_path / "runs/one", "Hopper-v5", 1)
     monkeypatch.chdir(tmp_path)
