@@ -174,30 +174,31 @@ def resample(strata: list[np.ndarray], seed: int) -> list[np.ndarray]:
 
 
 class Estimate(NamedTuple):
-    """A value and its 95 % interval, of the percentile bootstrap over seeds, stratified by task."""
+    """A value and its 95 % interval, of the percentile bootstrap over seeds, stratified by task; none of one seed."""
 
     value: float = math.nan
     low: float = math.nan
     high: float = math.nan
 
     @classmethod
-    def of(cls, value: float, resampled: np.ndarray) -> "Estimate":
-        return cls(float(value), *map(float, np.quantile(resampled, (0.025, 0.975))))
+    def of(cls, value: float, resampled: np.ndarray, samples: list[np.ndarray]) -> "Estimate":
+        bounds = np.quantile(resampled, (0.025, 0.975)) if min(map(len, samples)) > 1 else ()
+        return cls(float(value), *map(float, bounds))
 
     @classmethod
     def iqm(cls, strata: list[np.ndarray]) -> "Estimate":
         """Of all scores together."""
-        return cls.of(iqm(np.concatenate(strata)), iqm(np.concatenate(resample(strata, 0), axis=-1)))
+        return cls.of(iqm(np.concatenate(strata)), iqm(np.concatenate(resample(strata, 0), axis=-1)), strata)
 
     @classmethod
     def pair(cls, statistic: Callable, first: list[np.ndarray], second: list[np.ndarray]) -> "Estimate":
         """Of a statistic of two samples, mean over the tasks."""
         resampled = map(statistic, resample(first, 1), resample(second, 2))
-        return cls.of(np.mean([*map(statistic, first, second)]), np.mean([*resampled], axis=0))
+        return cls.of(np.mean([*map(statistic, first, second)]), np.mean([*resampled], axis=0), [*first, *second])
 
     def __str__(self) -> str:
         value, low, high = (shown(x, self.value) for x in self)
-        return value if math.isnan(self.value) or self.low == self.high else f"{value} [{low}, {high}]"
+        return value if math.isnan(self.low) or self.low == self.high else f"{value} [{low}, {high}]"
 
 
 class Spread(NamedTuple):
@@ -713,8 +714,7 @@ def check_folder(folder: Path, found: dict[str, Run]):
     if (folder / "runs.csv").exists():
         before = merge([*found.values(), *read_source(folder / "runs.csv", print)])
         if lost := [name for name in before if name not in found]:
-            some = ", ".join(lost[:3] + ["..."] * (len(lost) > 3))
-            refuse(f"{folder} has runs that no source has ({some}); name it as a source too to keep them")
+            refuse(f"{folder} has runs that no source has, as {lost[0]}; name it as a source too to keep them")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()

@@ -459,7 +459,7 @@ def interval(values) -> list[float]:
 def strata(monkeypatch):
     monkeypatch.setattr(report, "RESAMPLES", 300)
     rng = np.random.default_rng(3)
-    return [rng.normal(i, 1 + i, n).round(1) for i, n in enumerate((5, 3, 8, 1))]
+    return [rng.normal(i, 1 + i, n).round(1) for i, n in enumerate((5, 3, 8, 2))]
 
 
 def test_bootstrap_of_the_iqm(strata):
@@ -477,6 +477,9 @@ def test_probability_of_improvement(strata):
     others = [scores[:3].round() for scores in strata]
     value, *bounds = report.Estimate.pair(report.probability, strata, others)
     assert value == pytest.approx(mean(map(plain_probability, strata, others)))
+    for lone in ([scores[:1] for scores in strata], [*strata[1:], strata[0][:1]]):  # what it would vary by is unknown
+        estimates = report.Estimate.iqm(lone), report.Estimate.pair(report.probability, strata, lone)
+        assert np.isnan([x[1:] for x in estimates]).all()
     first, second = zip(*report.resample(strata, 1)), zip(*report.resample(others, 2))
     assert bounds == pytest.approx(interval([mean(map(plain_probability, x, y)) for x, y in zip(first, second)]))
 
@@ -585,7 +588,7 @@ BAD_INPUT = {
     "runs --depth 0": "--depth must be at least 1",
     "runs --out-dir mine": "mine/report.md was made by no report",
     "runs --out-dir runs/one": "runs/one/evaluations.csv was made by no report",
-    "runs --out-dir earlier": "earlier has runs that no source has (1, 2, 3, ...); name it",
+    "runs --out-dir earlier": "earlier has runs that no source has, as two; name it",
     "runs --out-dir mine/report.md": "cannot write to",
 }
 
@@ -599,8 +602,8 @@ def test_bad_input_is_refused(flags, sentence, tmp_path, make_report, capsys, mo
     (tmp_path / "mine/report.md").write_text("mine")
     (tmp_path / "torn/config.json").write_text("{")
     (tmp_path / "torn/result.json").touch()
-    for seed in (1, 2, 3, 4):
-        make_run(tmp_path / f"more/{seed}", "Hopper-v5", seed)
+    make_run(tmp_path / "more/two", "Hopper-v5", 2)
+    make_run(tmp_path / "more/zwei", "Hopper-v5", 2)
     make_report(tmp_path / "more", "--out-dir", tmp_path / "earlier")
     make_run(tmp_path / "runs/one", "Hopper-v5", 1)
     monkeypatch.chdir(tmp_path)
