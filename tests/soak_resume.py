@@ -12,19 +12,16 @@ import os
 import random
 import shutil
 import signal
-import sys
 import tempfile
 import time
 from pathlib import Path
 
-ROOT = Path(__file__).parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "sweeps")]
+import conftest  # noqa: F401  # it says where the others are
+import torch
+from resume_helpers import TASKS, Run, differences, ends_with, flags, interrupt, outcome
 
-import torch  # noqa: E402
-from resume_helpers import TASKS, Run, differences, ends_with, flags, interrupt, outcome  # noqa: E402
-
-import ppo_continuous  # noqa: E402
-import refineppo_continuous  # noqa: E402
+import ppo_continuous
+import refineppo_continuous
 
 SIGNALS = (signal.SIGKILL,) * 6 + (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, signal.SIGHUP)
 

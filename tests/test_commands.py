@@ -69,12 +69,6 @@ def check_config(run_dir: Path, script, env_id: str):
     assert {"python", "numpy", "mujoco"} <= set(config["versions"]) and {"git_commit", "cpu", "gpu"} <= set(config)
 
 
-def test_processors_of_one_name_are_told_apart(script):
-    """By the instructions that torch uses, which decide how it rounds; here by its own switch for them."""
-    program = f"import {script.__name__} as script; print(script.describe_machine()['cpu'])"
-    assert python("-c", program, ATEN_CPU_CAPABILITY="default").stdout.endswith(" (DEFAULT)\n")
-
-
 def check_result(run_dir: Path, script, env_id: str, total: int):
     """And evaluations.csv, which has the one evaluation of the training."""
     result, refines = read_json(run_dir / "result.json"), script is refineppo_continuous
@@ -189,6 +183,12 @@ def test_the_home_folder(script, tmp_path, monkeypatch, capsys):
     call_main(script, "--evaluate=~/x/best.pt")
     assert "mean return" in capsys.readouterr().out
     assert [path.name for path in tmp_path.iterdir()] == ["x"] and (tmp_path / "x/result.json").exists()
+
+
+def test_processors_of_one_name_are_told_apart(script):
+    """By the instructions that torch uses, which decide how it rounds; here by its own switch for them."""
+    program = f"import {script.__name__} as script; print(script.describe_machine()['cpu'])"
+    assert python("-c", program, ATEN_CPU_CAPABILITY="default").stdout.endswith(" (DEFAULT)\n")
 
 
 # --- Flags ------------------------------------------------------------------------------------------------------------

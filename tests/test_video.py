@@ -83,7 +83,7 @@ def test_window_and_videos_of_pygame(env_id, tmp_path):
         ("Hopper-v5", {"DISPLAY": "", "WAYLAND_DISPLAY": "", "MUJOCO_GL": "glfw"}),  # no screen
         ("Hopper-v5", {"MUJOCO_GL": "nonsense"}),  # MuJoCo cannot even be imported
         ("probe_envs:Counter-v0", {}),  # the task cannot be drawn
-        ("toy_env:Coordination-v0", {"PYTHONPATH": str(ROOT / "sweeps")}),  # it does not know the keyword render_mode
+        ("toy_env:Coordination-v0", {}),  # it does not know the keyword render_mode
     ],
 )
 def test_what_cannot_be_drawn_is_refused_before_training(env_id, platform, tmp_path):
