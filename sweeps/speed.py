@@ -1,4 +1,4 @@
-"""How fast the training scripts are, beside their fastest peers, the plain eager reference and the bare environment.
+"""How fast the training scripts are, beside their fastest peers and the bare environment.
 
     python sweeps/speed.py --env-id HalfCheetah-v5 --num-envs 1 --depths 1 2 4 8 --repeats 3
     python sweeps/speed.py --depths 4 --repeats 5 --against ../another-checkout
@@ -6,7 +6,7 @@
 All train with the same networks, rollouts of 2048 steps, 32 minibatches, 10 epochs and one thread. The methods take
 turns, so that a busy moment of the machine does not hit one alone. A first round, not counted, compiles with an empty
 cache and finds out how many steps take --seconds. Steps per second are without compilation and evaluation.
-The peers are Stable-Baselines3 and SBX, its sibling in JAX (the extra `bench`); the reference is `tests/reference.py`.
+The peers are Stable-Baselines3 and SBX, its sibling in JAX (the extra `bench`).
 
 Prints a table, and leaves it in sweeps/results/ as speed-<env>-<N>envs.md, with every run in a .csv beside it.
 """
@@ -44,7 +44,7 @@ class Args:
     num_envs: int = 1
     """environments stepped together"""
     depths: tuple[int, ...] = (1, 2, 4, 8)
-    """refinement depths K; the eager reference is run at 4, or at the last of them"""
+    """refinement depths K"""
     repeats: int = 3
     """runs of each method that count"""
     seconds: float = 15
@@ -82,9 +82,6 @@ def commands(args: Args) -> dict[str, list]:
             methods[name] = ["sweeps/speed.py", "peer", "--module", module, *learner]
         else:
             print(f"{name} is missing and left out: pip install -e '.[bench]'")
-    eager, depth = ["tests/reference.py", *learner, "--algorithm"], 4 if 4 in args.depths else args.depths[-1]
-    methods["eager PPO"] = [*eager, "ppo"]
-    methods[f"eager RefinePPO K = {depth}"] = [*eager, "refineppo", "--refinement-depth", depth]
     return methods | {"environment alone": ["sweeps/speed.py", "environment", *task]}
 
 
@@ -227,7 +224,6 @@ def speed_table(runs: dict[str, list[dict]]) -> str:
         if any(other.endswith(" there") for other in sps):
             row["x there"] = f"{sps[name] / sps[f'{name} there']:.3f}" if f"{name} there" in sps else ""
         row |= {f"x {peer.removesuffix(' PPO')}": ratio(name, peer) for peer in PEERS}
-        row["x eager reference"] = ratio(name, f"eager {name}")
         row["time per step / K = 1"] = ratio("RefinePPO K = 1", name) if name.startswith("RefinePPO") else ""
         row["of the environment's rate"] = f"{100 * sps[name] / sps['environment alone']:.0f} %"
         row["peak MiB: cold, warm"] = f"{cold['peak_mib']:.0f}, {max(r['peak_mib'] for r in warm):.0f}"

@@ -1,10 +1,12 @@
 """Fixtures shared by all tests. The scripts are imported as modules; their commands run as a user types them."""
 
 import ast
+import csv
 import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # the tests themselves run in parallel
@@ -13,6 +15,8 @@ ROOT = Path(__file__).parent.parent
 PATHS = [str(ROOT), str(ROOT / "tests"), str(ROOT / "sweeps")]
 sys.path[:0] = PATHS
 
+import matplotlib.image  # noqa: E402
+import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 import torch  # noqa: E402
 from gymnasium.spaces import Box  # noqa: E402
@@ -39,6 +43,30 @@ def python(*words, cwd=ROOT, timeout=600, **env) -> subprocess.CompletedProcess:
 def run(name: str, *flags, **options) -> subprocess.CompletedProcess:
     """The script NAME with these flags, as `python` runs it."""
     return python(ROOT / name, *flags, **options)
+
+
+def wait_until(condition, timeout=300, pause=0.05):
+    end = time.time() + timeout
+    while not condition():
+        assert time.time() < end, "it did not happen in time"
+        time.sleep(pause)
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    """Everything in a folder, at any depth; of folders nothing but their names."""
+    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"" for path in folder.rglob("*")}
+
+
+def check_picture(path: Path):
+    """It opens, has a white corner, and is neither of one colour nor a dot on an empty page."""
+    pixels = matplotlib.image.imread(path)[..., :3]
+    assert min(pixels.shape[:2]) > 200 and (pixels[0, 0] == 1).all()
+    assert (pixels.min(-1) < 0.9).mean() > 0.01 and len(np.unique(pixels.reshape(-1, 3), axis=0)) > 20
 
 
 def imports(source: str) -> set[str]:

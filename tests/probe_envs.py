@@ -1,17 +1,8 @@
-"""Tiny environments, each of which asks one thing; use them as `probe_envs:NAME-v0`.
-
-ConstantReward      one step, reward 1: the value must become 1
-MatchAction         one step; the right action is -s, the reward minus the squared distance from it
-TwoStepCredit       two steps; the second one's reward is that of the first action
-Counter             the observation and the reward are the number of steps; truncated after 7
-Terminator          the same, terminated after 5
-Unbounded           two actions without bounds
-Discrete            discrete actions, which are not supported
-"""
+"""Tiny environments, each of which asks one thing; use them as `probe_envs:NAME-v0`."""
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box
 
 
 class Probe(gym.Env):
@@ -36,18 +27,22 @@ class Probe(gym.Env):
 
 
 class ConstantReward(Probe):
+    """One step, reward 1: the value must become 1."""
+
     def step(self, action):
         return self.observe(), 1.0, True, False, {}
 
 
 class MatchAction(Probe):
+    """One step; the right action is -s, the reward minus the squared distance from it."""
+
     def step(self, action):
         reward = -float((action[0] + self.obs[0]) ** 2)
         return self.observe(), reward, True, False, {}
 
 
 class TwoStepCredit(Probe):
-    """Observes (s, 0), then (0, 1)."""
+    """Observes (s, 0), then (0, 1); the second step's reward is that of the first one's action."""
 
     observation_space = Box(-1, 1, (2,))
 
@@ -65,6 +60,8 @@ class TwoStepCredit(Probe):
 
 
 class Counter(Probe):
+    """The observation and the reward are the number of steps; truncated after 7."""
+
     observation_space = Box(0, np.inf, (1,))
     last_step = None
 
@@ -79,6 +76,8 @@ class Counter(Probe):
 
 
 class Terminator(Counter):
+    """Terminated after 5 instead."""
+
     last_step = 5
 
 
@@ -86,12 +85,7 @@ class Unbounded(Probe):
     action_space = Box(-np.inf, np.inf, (2,))
 
 
-class DiscreteActions(Probe):
-    action_space = Discrete(2)
-
-
 for env in (ConstantReward, MatchAction, TwoStepCredit, Terminator):
     gym.register(f"{env.__name__}-v0", env)
 gym.register("Counter-v0", Counter, max_episode_steps=7)
-gym.register("Discrete-v0", DiscreteActions, max_episode_steps=50)
 gym.register("Unbounded-v0", Unbounded, max_episode_steps=50)

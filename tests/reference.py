@@ -1,52 +1,12 @@
-"""PPO and RefinePPO written the obvious way: eager PyTorch, gymnasium's own wrappers, and no thought of speed.
-
-The tests hold the training scripts equal to `eager_loss` and `eager_update`; `sweeps/speed.py` compares the speed of
-the scripts with that of this file's command:
-
-    python tests/reference.py --algorithm refineppo --env-id HalfCheetah-v5 --total-timesteps 20480
-
-Every environment has the usual stack of wrappers, as in the well-known scripts, but an episode's last step is also
-the next one's reset (SAME_STEP): the default of gymnasium 1 puts one fake transition per episode into the batch. At
-one environment this is the very algorithm of the training scripts. With several, each has statistics of its own, where
-the scripts share them: the same speed, but one policy sees differently scaled states, and learns worse.
+"""PPO and RefinePPO written the obvious way, for the tests to hold the training scripts equal to: eager PyTorch,
+gymnasium's own wrappers, and no thought of speed.
 """
-
-import time
-from dataclasses import dataclass
-from typing import Literal
 
 import gymnasium as gym
 import numpy as np
 import torch
-import tyro
 from torch import nn
 from torch.distributions import Normal
-
-
-@dataclass
-class Args:
-    """Flags as those of the training scripts, whose --help explains them."""
-
-    algorithm: Literal["ppo", "refineppo"] = "ppo"
-    env_id: str = "HalfCheetah-v5"
-    total_timesteps: int = 1_000_000
-    seed: int = 1
-    cuda: bool = False  # act there too
-    refinement_depth: int = 4
-    refinement_schedule: Literal["average", "uniform", "inverse"] = "average"
-    num_envs: int = 1
-    num_steps: int = 2048
-    num_minibatches: int = 32
-    update_epochs: int = 10
-    learning_rate: float = 3e-4
-    gamma: float = 0.99
-    gae_lambda: float = 0.95
-    clip_coef: float = 0.2
-    norm_adv: bool = True
-    clip_vloss: bool = True
-    ent_coef: float = 0.0
-    vf_coef: float = 0.5
-    max_grad_norm: float = 0.5
 
 
 def mlp(sizes: list[int], output_gain: float) -> nn.Sequential:
@@ -59,13 +19,14 @@ def mlp(sizes: list[int], output_gain: float) -> nn.Sequential:
 
 
 class Agent(nn.Module):
-    """The Gaussian policy and the value function; K = None is plain PPO."""
+    """The Gaussian policy and the value function; without a refinement depth, K = None, plain PPO."""
 
-    def __init__(self, obs_dim, action_dim, K, schedule, actor_hidden=(128, 128), critic_hidden=(64, 64)):
+    def __init__(self, obs_dim: int, action_dim: int, args):
         super().__init__()
-        self.K, self.schedule, self.action_dim = K, schedule, action_dim
-        self.actor = mlp([obs_dim if K is None else obs_dim + action_dim, *actor_hidden, action_dim], 0.01)
-        self.critic = mlp([obs_dim, *critic_hidden, 1], 1.0)
+        self.K, self.schedule = getattr(args, "refinement_depth", None), getattr(args, "refinement_schedule", "")
+        self.action_dim, inputs = action_dim, obs_dim if self.K is None else obs_dim + action_dim
+        self.actor = mlp([inputs, *args.actor_hidden, action_dim], 0.01)
+        self.critic = mlp([obs_dim, *args.critic_hidden, 1], 1.0)
         self.log_std = nn.Parameter(torch.zeros(action_dim))
 
     def proposals(self, obs: torch.Tensor) -> list[torch.Tensor]:
@@ -134,62 +95,3 @@ def make_env(env_id: str, gamma: float) -> gym.Env:
     env = gym.wrappers.TransformObservation(env, lambda obs: np.clip(obs, -10, 10), env.observation_space)
     env = gym.wrappers.NormalizeReward(env, gamma=gamma)
     return gym.wrappers.TransformReward(env, lambda reward: np.clip(reward, -10, 10))
-
-
-def train(args: Args) -> tuple[list[float], float]:
-    """Train; return the raw return of every episode, and the steps per second."""
-    torch.manual_seed(args.seed)
-    device = torch.device("cuda" if args.cuda else "cpu")
-    makers = [lambda: make_env(args.env_id, args.gamma)] * args.num_envs
-    envs = gym.vector.SyncVectorEnv(makers, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)
-    obs_dim, action_dim = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
-    K = args.refinement_depth if args.algorithm == "refineppo" else None
-    agent = Agent(obs_dim, action_dim, K, args.refinement_schedule).to(device)
-    optimizer = make_optimizer(agent, args)
-
-    shape = args.num_steps, args.num_envs
-    all_obs, actions = torch.zeros(*shape, obs_dim, device=device), torch.zeros(*shape, action_dim, device=device)
-    logprobs, rewards, ends, values = (torch.zeros(shape, device=device) for _ in range(4))
-    batch_size, returns = args.num_envs * args.num_steps, []
-    obs, _ = envs.reset(seed=args.seed)
-    start = time.time()
-    iterations = args.total_timesteps // batch_size
-    for iteration in range(iterations):
-        optimizer.param_groups[0]["lr"] = (1 - iteration / iterations) * args.learning_rate
-
-        for t in range(args.num_steps):
-            all_obs[t] = torch.as_tensor(obs)
-            with torch.no_grad():
-                policy = agent.policy(all_obs[t])
-                actions[t] = policy.sample()
-                logprobs[t] = policy.log_prob(actions[t]).sum(-1)
-                values[t] = agent.value(all_obs[t])
-            obs, reward, terminated, truncated, infos = envs.step(actions[t].cpu().numpy())
-            rewards[t] = torch.as_tensor(reward)
-            ends[t] = torch.as_tensor(terminated | truncated)
-            if "final_info" in infos:
-                episode = infos["final_info"]["episode"]
-                returns += episode["r"][episode["_r"]].tolist()
-
-        with torch.no_grad():
-            next_value = agent.value(torch.as_tensor(obs, dtype=torch.float32, device=device))
-        advantages, advantage = torch.zeros_like(rewards), 0.0
-        for t in reversed(range(args.num_steps)):
-            delta = rewards[t] + args.gamma * (1 - ends[t]) * next_value - values[t]
-            advantages[t] = advantage = delta + args.gamma * args.gae_lambda * (1 - ends[t]) * advantage
-            next_value = values[t]
-
-        batch = [x.flatten(0, 1) for x in (all_obs, actions, logprobs, advantages, advantages + values, values)]
-        for _ in range(args.update_epochs):
-            for index in torch.randperm(batch_size, device=device).split(batch_size // args.num_minibatches):
-                eager_update(agent, optimizer, args, *(x[index] for x in batch))
-    return returns, iterations * batch_size / (time.time() - start)
-
-
-if __name__ == "__main__":
-    args = tyro.cli(Args, description=__doc__)
-    torch.set_num_threads(1)
-    returns, sps = train(args)
-    if returns:
-        print(f"mean return of the last 10 episodes: {np.mean(returns[-10:]):.1f}")
-    print(f"{sps:.0f} steps/s")

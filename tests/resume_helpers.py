@@ -22,22 +22,9 @@ TASKS = (
     "Ant-v5 HalfCheetah-v5 Hopper-v5 Walker2d-v5 Swimmer-v5 Pusher-v5 Reacher-v5 HumanoidStandup-v5 Humanoid-v5 "
     "Pendulum-v1 MountainCarContinuous-v0 LunarLanderContinuous-v3 BipedalWalker-v3 BipedalWalkerHardcore-v3"
 ).split()
-TINY = {
-    "env_id": "Pendulum-v1",
-    "total_timesteps": 512,
-    "num_steps": 64,
-    "num_minibatches": 4,
-    "update_epochs": 2,
-    "actor_hidden": 16,
-    "critic_hidden": 16,
-    "eval_interval": 128,
-    "eval_episodes": 2,
-    "final_eval_episodes": 2,
-    "checkpoint_interval": 64,
-    "save_every": 192,
-    "compile": False,
-    "progress": False,
-}
+TINY = dict(env_id="Pendulum-v1", total_timesteps=512, num_steps=64, num_minibatches=4, update_epochs=2)
+TINY |= dict(actor_hidden=16, critic_hidden=16, eval_interval=128, eval_episodes=2, final_eval_episodes=2)
+TINY |= dict(checkpoint_interval=64, save_every=192, compile=False, progress=False)
 
 
 def flags(run_dir: Path, *more: str, **settings) -> list:
@@ -122,12 +109,6 @@ class Run:
             self.process.kill()  # else pytest would wait for it at its own end
             raise TimeoutError(self.output())
         return self.process.exitcode
-
-    def wait_until(self, condition, timeout=120):
-        end = time.time() + timeout
-        while not condition():
-            assert self.process.is_alive() and time.time() < end, self.output()
-            time.sleep(0.01)
 
     def output(self) -> str:
         return os.pread(self.log.fileno(), 10**6, 0).decode(errors="replace")

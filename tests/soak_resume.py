@@ -6,7 +6,6 @@ Script, task, settings, the number of kills, their moments and signals are drawn
 difference, and keeps both run folders.
 """
 
-import argparse
 import logging
 import os
 import random
@@ -18,6 +17,7 @@ from pathlib import Path
 
 import conftest  # noqa: F401  # it says where the others are
 import torch
+import tyro
 from resume_helpers import TASKS, Run, differences, ends_with, flags, interrupt, outcome
 
 import ppo_continuous
@@ -49,16 +49,13 @@ def random_settings(rng: random.Random) -> dict:
     return settings | {switch: rng.random() < 0.5 for switch in switches}
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=60, help="how long to go on")
-    parser.add_argument("--seed", type=int, default=0, help="seed of every choice but the clock")
-    options = parser.parse_args()
+def main(minutes: float = 60, seed: int = 0):
+    """Go on for so many minutes; the seed is of every choice but the clock."""
     torch.set_num_threads(1)
     logging.disable(logging.WARNING)  # TensorBoard tells of every purge
-    end, rounds = time.time() + 60 * options.minutes, 0
+    end, rounds = time.time() + 60 * minutes, 0
     while time.time() < end:
-        rng, folder = random.Random(f"{options.seed} {rounds}"), Path(tempfile.mkdtemp(prefix="soak_resume_"))
+        rng, folder = random.Random(f"{seed} {rounds}"), Path(tempfile.mkdtemp(prefix="soak_resume_"))
         script, settings = rng.choice((ppo_continuous, refineppo_continuous)), random_settings(rng)
         print(f"{rounds}: {script.__name__} {settings} in {folder}", flush=True)
         start = time.time()
@@ -85,4 +82,4 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__)

@@ -1,53 +1,26 @@
 """Stands in for a training script beside tune.py: it takes a second, and every step of it can be counted.
 
 A training has STEPS steps, each a line in steps.txt; its result follows from the flags. FAULTS names what goes wrong in
-which trial, as in {"trial_1": "crashes"}.
+which trial, as in {"trial_1": "crashes"}. Its flags are those of the script for which it stands, from a file beside it.
 """
 
 import fcntl
 import json
 import math
 import os
+import pickle
 import signal
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, make_dataclass
 from pathlib import Path
 
 import tyro
 
-
-@dataclass(frozen=True)
-class Args:
-    env_id: str = "HalfCheetah-v5"
-    total_timesteps: int = 6_000_000
-    seed: int = 1
-    run_dir: str | None = None
-    resume: bool = False
-    refinement_depth: int = 4
-    refinement_schedule: str = "average"
-    learning_rate: float = 3e-4
-    anneal_lr: bool = True
-    num_envs: int = 1
-    num_steps: int = 2048
-    num_minibatches: int = 32
-    update_epochs: int = 10
-    gamma: float = 0.99
-    gae_lambda: float = 0.95
-    clip_coef: float = 0.2
-    ent_coef: float = 0.0
-    vf_coef: float = 0.5
-    max_grad_norm: float = 0.5
-    log_std_init: float = 0.0
-    normalize_obs: bool = True
-    normalize_reward: bool = True
-    eval_interval: int = 100_000
-    eval_episodes: int = 10
-    final_eval_episodes: int = 10
-    progress: bool = True
+Args = make_dataclass("Args", pickle.loads(Path(__file__).with_suffix(".pickle").read_bytes()), frozen=True)
 
 
-def main(args: Args):
+def main(args):
     signals, run_dir = [], Path(args.run_dir)
     signal.signal(signal.SIGTERM, lambda *_: signals.append(1))
     fault = json.loads(os.environ.get("FAULTS", "{}")).get(run_dir.parent.name)

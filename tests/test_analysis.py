@@ -84,16 +84,9 @@ def analyse(*paths: Path, flags: str) -> tuple[dict[str, pd.DataFrame], list[Fig
     return tables, [call.args[0] for call in saved.call_args_list]
 
 
-def network(layers: list, x: np.ndarray) -> np.ndarray:
-    *hidden, (w_out, b_out) = layers
-    for w, b in hidden:
-        x = np.tanh(x @ w + b)
-    return x @ w_out + b_out
-
-
 def f(policy: Policy, obs: np.ndarray, m: np.ndarray) -> np.ndarray:
     """f(s, m), (n, action_dim), in double precision."""
-    return network(refineppo.layers(policy.agent.arrays(), "actor"), np.hstack([obs, m]))
+    return refineppo.network(refineppo.layers(policy.agent.arrays(), "actor"), np.hstack([obs, m]))
 
 
 def proposals_of(policy: Policy, obs: np.ndarray, coefficients: list[float] | None = None) -> np.ndarray:
@@ -339,7 +332,7 @@ def test_the_fitted_network_is_128_by_128_and_reproduces_a_function_of_the_obser
 
     weights = analysis.fit_one_pass(obs, target(obs).astype(np.float32), seed=0)
     assert [w.shape for w, _ in weights] == [(3, 128), (128, 128), (128, 3)]
-    fitted = network(weights, held_out)
+    fitted = refineppo.network(weights, held_out)
     assert min(r2_score(target(held_out)[:, :2], fitted[:, :2], multioutput="raw_values")) > 0.95
     np.testing.assert_allclose(fitted[:, 2], 0.5, atol=1e-6)
     weights = analysis.fit_one_pass(obs, target(obs)[:, :1], seed=0)
@@ -389,27 +382,6 @@ def test_adaptive_equals_plain_episodes(tmp_path):
         returns = play(policy, act, final_seeds(policy, 2))
         assert row.steps_mean == pytest.approx(np.mean(used), abs=0.02)
         assert row.return_mean == pytest.approx(np.mean(returns), rel=2e-2)
-
-
-def test_adaptive_tolerances_spread_the_mean_steps_where_corrections_grow(tmp_path):
-    """f = s + m and c_k = 1: corrections of 1, 2, 4, 8 times |s|, so that a state stops after its first step or not at
-    all. Yet from all four steps to one the means leave no gap; and they are drawn as points, without a line through
-    what was not measured."""
-    policy = linear_policy(tmp_path / "best.pt", np.eye(2), refinement_schedule="uniform")
-    tables, figures = analyse(policy.path, flags="--sections adaptive anytime --episodes 3 --num-states 500")
-    rows, fixed = tables["adaptive"], tables["anytime"][1:5]
-    assert len(rows) == 8 and rows.steps_mean[0] == 4 and rows.steps_mean[7] < 1.05
-    assert rows.steps_mean.is_monotonic_decreasing and max(-np.diff(rows.steps_mean)) < 0.8
-    assert rows["quantile"].is_monotonic_increasing and (rows["quantile"][0], rows.tolerance[0]) == (0, 0)
-    norms = np.linalg.norm(states(policy, 500)[0], axis=1)  # of the first corrections, the smallest
-    for row in rows[1:].itertuples():
-        assert row.tolerance == pytest.approx(np.quantile([norms] * 3, row.quantile))
-        assert row.steps_mean == pytest.approx(4 - 3 * row.quantile, abs=0.3)
-    (axis,) = [figure.axes[0] for figure in figures if len(figure.axes) == 1]
-    points, same = axis.lines[0].get_xydata(), axis.lines[-1].get_xydata()
-    assert points.tolist() == rows[["steps_mean", "return_mean"]].to_numpy().tolist()
-    assert same.tolist() == fixed[["steps", "return_mean"]].to_numpy().tolist()
-    assert {line.get_linestyle() for line in axis.lines} == {"None"}
 
 
 # --- Training ---------------------------------------------------------------------------------------------------------

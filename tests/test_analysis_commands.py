@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from conftest import run
+from conftest import check_picture, run
 from test_analysis import save
 from test_commands import call_main
 from test_failures import Malicious
@@ -52,18 +52,14 @@ def small(monkeypatch):
 
 
 def assert_complete(folder: Path, *tables: str, first=(), across=()):
-    """These tables and a figure of each, if it has one of its own, and no others; the tables have their columns, and
-    the pictures are neither of one colour nor a dot on an empty page."""
+    """These tables and a figure of each, if it has one of its own, and no others; the tables have their columns."""
     pictures = {f"{name}.png" for name in tables} - {"anytime_scaled.png", "delta_r2_checks.png"}
     names = {f"{name}.csv" for name in tables} | {f"{name}_across_seeds.csv" for name in across} | {"summary.json"}
     assert {path.name for path in folder.iterdir()} == names | pictures
     for name in tables:
         assert [*pd.read_csv(folder / f"{name}.csv")] == [*first, *COLUMNS[name].split(",")]
     for path in folder.glob("*.png"):
-        pixels = matplotlib.image.imread(path)[..., :3]
-        assert min(pixels.shape[:2]) > 200
-        assert (pixels.min(-1) < 0.9).mean() > 0.01
-        assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 20
+        check_picture(path)
 
 
 def test_the_papers_two_analyses_are_the_default(tmp_path, capsys):
@@ -108,21 +104,6 @@ def test_a_section_alone(section, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_the_same_command_gives_the_same_tables(tmp_path):
-    """Another seed gives others, but of the policy's own return."""
-    for out, seed in (("a", 0), ("b", 0), ("c", 1)):
-        flags = "--num-states", 30, "--out-dir", tmp_path / out, "--sections", "r2", "dynamics", "feedback"
-        analyse("--checkpoint", save(tmp_path / "best.pt"), "--seed", seed, *flags)
-    for name in ("delta_r2", "delta_r2_checks", "dynamics", "feedback"):
-        first, again, other = ((tmp_path / out / f"{name}.csv").read_bytes() for out in "abc")
-        assert first == again != other
-    first, other = (pd.read_csv(tmp_path / out / "feedback.csv").set_index("reads") for out in "ac")
-    assert first.loc["own"].equals(other.loc["own"])
-    assert first.return_mean["another_state"] != other.return_mean["another_state"]
-    assert first.r2["one_pass"] != other.r2["one_pass"]
-
-
-@pytest.mark.slow
 def test_seeds_of_one_setting(tmp_path):
     """Each seed's own rows as if analysed alone, and beside them the mean and standard deviation across the seeds, of
     delta R^2 also where a component is late in some of them only."""
@@ -140,11 +121,8 @@ def test_seeds_of_one_setting(tmp_path):
         pd.testing.assert_frame_equal(own, pd.read_csv(alone / f"{name}.csv"), check_exact=True)
     for name, value in (("settling_error", "error"), ("delta_r2", "delta_r2")):
         keys = ["component", "step" if name == "settling_error" else "step_from"]
-        groups, across = (
-            pd.read_csv(out / f"{name}.csv").groupby(keys)[value],
-            pd.read_csv(out / f"{name}_across_seeds.csv"),
-        )
-        across = across.set_index(keys)
+        groups = pd.read_csv(out / f"{name}.csv").groupby(keys)[value]
+        across = pd.read_csv(out / f"{name}_across_seeds.csv").set_index(keys)
         assert across.seeds.to_dict() == groups.size().to_dict()
         assert across[f"{value}_mean"].to_dict() == pytest.approx(groups.mean().to_dict())
         assert across[f"{value}_std"].to_dict() == pytest.approx(groups.std(ddof=1).fillna(0).to_dict())

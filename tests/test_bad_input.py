@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from conftest import run
+from conftest import files_of, run
 from test_commands import QUICK, call_main
 
 import refineppo_continuous
@@ -49,15 +49,12 @@ def refuses(script, tmp_path, monkeypatch, capsys, recwarn):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/config.json").write_text("of another program")
 
-    def contents() -> dict:
-        return {path: path.read_bytes() if path.is_file() else None for path in tmp_path.rglob("*")}
-
     def refuses(*flags) -> str:
-        before = contents()
+        before = files_of(tmp_path)
         with pytest.raises(SystemExit) as stop:
             call_main(script, *QUICK, "--env-id", "Pendulum-v1", *flags)
         assert stop.value.code == 2
-        assert contents() == before
+        assert files_of(tmp_path) == before
         shown = capsys.readouterr()
         assert shown.out == "" and not [w for w in recwarn if w.category is UserWarning]  # it would be shown, too
         (line,) = shown.err.splitlines()

@@ -18,6 +18,7 @@ import torch
 from conftest import ROOT, imports, python, run
 from resume_helpers import TASKS
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.custom_scalar.layout_pb2 import Layout
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 import refineppo_continuous
@@ -143,6 +144,22 @@ def test_what_a_longer_run_logs_keeps_and_prints(script, tmp_path, capsys):
     assert "evaluation" not in capsys.readouterr().out
 
 
+def test_what_tensorboard_draws_together(script, tmp_path):
+    """Under Custom Scalars, by its own rule, re.match: the returns, and each refinement quantity's K lines."""
+    depth = ("--refinement-depth", 11) if script is refineppo_continuous else ()
+    call_main(script, *QUICK, *depth, "--env-id", "probe_envs:Counter-v0", "--run-dir", tmp_path)
+    events, expected = read_events(tmp_path), {"return": {"eval/return_mean", "charts/episodic_return"}}
+    for name in {scalar[:-2].removeprefix("refinement/") for scalar in REFINEMENT} if depth else ():
+        expected[name] = {f"refinement/{name}_{k}" for k in range(1, 12)}
+    (layout,) = events.Tensors("custom_scalars__config__")
+    (category,) = Layout.FromString(layout.tensor_proto.string_val[0]).category
+    tags = events.Tags()["scalars"]
+    shown = {
+        chart.title: {t for t in tags if any(re.match(x, t) for x in chart.multiline.tag)} for chart in category.chart
+    }
+    assert shown == expected
+
+
 WITHOUT_POSIX = """
 import runpy, signal, sys
 sys.modules["fcntl"] = None  # `import fcntl` then raises ImportError
@@ -162,17 +179,6 @@ def test_without_posix(name, tmp_path):
     done = python("-c", WITHOUT_POSIX, name, *words)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "result.json").exists() == trains
-
-
-@pytest.mark.slow
-def test_a_locale_without_the_letters_of_a_path(script, tmp_path):
-    """In ASCII the run ends with its result; where Python cannot even name the folder, it is refused before."""
-    name, words = f"{script.__name__}.py", (*QUICK, "--env-id", "Pendulum-v1", "--run-dir", tmp_path / "Übung é")
-    refused = run(name, *words, LC_ALL="C", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0")
-    assert refused.returncode == 2 and refused.stderr.count("\n") == 1 and list(tmp_path.iterdir()) == []
-    done = run(name, *words, PYTHONIOENCODING="ascii")
-    assert done.returncode == 0 and done.stderr == "" and "the run is in " in done.stdout
-    assert (tmp_path / "Übung é/result.json").exists()
 
 
 def test_the_home_folder(script, tmp_path, monkeypatch, capsys):

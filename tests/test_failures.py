@@ -15,7 +15,7 @@ from unittest import mock
 
 import pytest
 import torch
-from conftest import ROOT
+from conftest import ROOT, wait_until
 from resume_helpers import KILLED, Run, ends_with, finish_exactly, flags, outcome, refusal, send
 from test_commands import call_main, read_json
 
@@ -103,7 +103,7 @@ def test_interrupt_while_compiling(script, tmp_path):
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(cache)
 
     stopped = Run(script, flags(tmp_path / "run", compile=True), before=isolate)
-    stopped.wait_until(lambda: any(cache.rglob("*.cpp")))
+    wait_until(lambda: any(cache.rglob("*.cpp")))
     time.sleep(0.3)
     os.killpg(stopped.process.pid, signal.SIGINT)
     assert stopped.wait() == 75, stopped.output()

@@ -1,18 +1,17 @@
 """sweeps/report.py on hand-made run folders, against tables computed by hand and statistics as plain loops."""
 
-import csv
 import itertools
 import json
 import re
 import shutil
 import sys
 from pathlib import Path
-from statistics import mean, quantiles, stdev
+from statistics import mean, stdev
 
-import matplotlib.image
 import numpy as np
 import pytest
-from conftest import ROOT, run
+from conftest import ROOT, check_picture, files_of, read_csv, run
+from scipy.stats import trim_mean
 
 from sweeps import report
 
@@ -77,16 +76,7 @@ def table(text: str, header: str) -> dict[str, list[str]]:
     return {first: cells for first, *cells in rows}
 
 
-def read(path: Path) -> list[dict]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def files_of(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-PAPER, BOUNDS = (read(ROOT / "sweeps" / name) for name in ("paper_results.csv", "bounds.csv"))
+PAPER, BOUNDS = (read_csv(ROOT / "sweeps" / name) for name in ("paper_results.csv", "bounds.csv"))
 LIMITS = {row["task"]: (float(row["random_return"]), float(row["reference_return"])) for row in BOUNDS}
 
 
@@ -105,7 +95,7 @@ def test_table_1(tmp_path, make_report):
     assert rows["Pusher-v5"] == "7|-45.0 ± 7.1|-37.5 ± 10.6|+16.7|-44.0 ± 10|-37 ± 9|+15.9|2".split("|")
     assert rows["Ant-v5"][1:4] == ["100", "-", "-"] and rows["Ant-v5"][-1] == "1 / 0"
     assert rows["Other-v0"] == "-|1.50 ± 0.71|3.00 ± 0.00|+100.0|-|-|-|2".split("|")
-    hopper = read(tmp_path / "report/6M/table1.csv")[1]
+    hopper = read_csv(tmp_path / "report/6M/table1.csv")[1]
     assert float(hopper["refineppo_std"]) == pytest.approx(stdev([2500, 3500])) and hopper["paper_ppo_std"] == "826"
     missing = section(text, "What is missing")
     assert "- no finished run of PPO: HalfCheetah-v5, Walker2d-v5, Swimmer-v5, Reacher-v5, " in missing
@@ -126,7 +116,7 @@ def test_sample_efficiency(tmp_path, make_report):
     by_hand = "10.0 ± 0.0|24.4 ± 11.5|+143.8|30.0|1 of 2|never (300 to never)|1 of 2|never (200 to never)"
     assert rows["Hopper-v5"] == by_hand.split("|")
     assert rows["Ant-v5"] == ["5.00", "12.5", "+150.0", "6.00", "1 of 1", "200", "1 of 1", "100"]
-    assert read(tmp_path / "report/6M/sample_efficiency.csv")[1]["refineppo_mean_return_mean"] == "24.375"
+    assert read_csv(tmp_path / "report/6M/sample_efficiency.csv")[1]["refineppo_mean_return_mean"] == "24.375"
 
 
 def test_table_2(tmp_path, make_report):
@@ -155,7 +145,7 @@ def test_depth(tmp_path, make_report):
     rows = table(text, "Fig. 4")
     assert [rows[k][0] for k in "124"] == ["0.00 ± 0.00", "0.43 ± 0.40", "1.00 ± 0.00"]
     assert [(rows[k][1], rows[k][3]) for k in "124"] == [("3", "2")] * 3  # tasks
-    for row, means in zip(read(tmp_path / "report/6M/depth_normalised.csv"), returns.values()):
+    for row, means in zip(read_csv(tmp_path / "report/6M/depth_normalised.csv"), returns.values()):
         limits = LIMITS["Hopper-v5"], LIMITS["Reacher-v5"]
         scores = [(x - low) / (high - low) for x, (low, high) in zip(means, limits)]
         assert float(row["fixed_bounds_mean"]) == pytest.approx(mean(scores))
@@ -185,22 +175,19 @@ def test_few_seeds(tmp_path, make_report):
     make_seeds(tmp_path, ant | {"Other-v0": [4]}, depth=4)
     make_seeds(tmp_path, {"Hopper-v5": [2500, 3000, 3500]}, depth=4, late=None)
     text, out = make_report(tmp_path), tmp_path / "report/6M"
-    ant, hopper, _ = read(out / "seeds.csv")
+    ant, hopper, _ = read_csv(out / "seeds.csv")
     assert ant["ppo_iqm_value"] == ant["refineppo_iqm_value"] == "200.0" and ant["p_improvement_value"] == "0.5"
     value, low, high = (float(hopper[f"p_improvement_{part}"]) for part in ("value", "low", "high"))
     assert value == pytest.approx(7.5 / 9) and 0 <= low < value < high
     assert table(text, "What few seeds")["Other-v0"][0] == "3.00"  # no interval of one seed
-    best, last, late = read(out / "aggregate.csv")
+    best, last, late = read_csv(out / "aggregate.csv")
     assert float(best["p_improvement_value"]) == pytest.approx((7.5 / 9 + 0.5) / 2)
     assert best["tasks"] == last["tasks"] == "2" and late["tasks"] == "1"  # no episode ended in Hopper's last 10 %
     low, high = LIMITS["Ant-v5"]
     assert float(late["ppo_iqm_value"]) == pytest.approx((5 - low) / (high - low))
-    row = read(out / "selection.csv")[1]
-    assert (row["ppo_best_mean"], row["ppo_last_mean"], row["refineppo_last_10_percent_mean"]) == (
-        "2000.0",
-        "1999.0",
-        "",
-    )
+    row = read_csv(out / "selection.csv")[1]
+    assert (row["ppo_best_mean"], row["ppo_last_mean"]) == ("2000.0", "1999.0")
+    assert row["refineppo_last_10_percent_mean"] == ""
     assert "no episode ended in the last 10 % of 3 seeds of RefinePPO K=4 average: Hopper-v5" in text
     assert "Left out, without bounds: Other-v0." in text
 
@@ -250,7 +237,7 @@ def test_controls(tmp_path, make_report):
     make_seeds(tmp_path, {"Ant-v5": [0, 0]}, prefix="w", actor_hidden=[216, 216])
     make_report(tmp_path)
     out, wide = tmp_path / "report/6M", "PPO 216x216 / PPO 256x256"
-    rows = read(out / "controls_differences.csv")
+    rows = read_csv(out / "controls_differences.csv")
     assert [*dict.fromkeys(row["difference"] for row in rows)] == [
         "RefinePPO K=1 average - PPO",
         "RefinePPO K=4 average - PPO",
@@ -267,15 +254,14 @@ def test_controls(tmp_path, make_report):
     assert [float(row["best_p_higher_value"]) for row in rows[:3]] == [0.875, 0.75, 0.8125]
     assert hopper["last_difference_value"] == "500.0"
     assert hopper["last_10_percent_difference_value"] == both["last_10_percent_difference_value"] == ""
-    methods = {row["method"]: row for row in read(out / "controls.csv") if row["task"] == "Hopper-v5"}
+    methods = {row["method"]: row for row in read_csv(out / "controls.csv") if row["task"] == "Hopper-v5"}
     assert methods[wide]["best_mean"] == "2000.0"
     after = 128 * 128 + 128 * 3  # multiplications after the first layer, which reads 11 numbers once, and m_k, not m_0
-    costs = [
-        int(methods[name]["multiplications"]) for name in ("PPO", "RefinePPO K=1 average", "RefinePPO K=4 average")
-    ]
-    assert costs == [11 * 128 + after, 11 * 128 + after, 11 * 128 + 3 * 3 * 128 + 4 * after]
-    assert int(methods["PPO"]["parameters"]) == 12 * 128 + 129 * 128 + 129 * 3
-    assert int(methods["RefinePPO K=4 average"]["parameters"]) == (12 + 3) * 128 + 129 * 128 + 129 * 3
+    costs = {name: (int(row["multiplications"]), int(row["parameters"])) for name, row in methods.items()}
+    assert costs["PPO"] == (11 * 128 + after, 12 * 128 + 129 * 128 + 129 * 3)
+    assert costs["RefinePPO K=1 average"][0] == costs["PPO"][0]
+    refined = 11 * 128 + 3 * 3 * 128 + 4 * after, (12 + 3) * 128 + 129 * 128 + 129 * 3
+    assert costs["RefinePPO K=4 average"] == refined
 
 
 def test_learning_rates(tmp_path, make_report):
@@ -285,12 +271,11 @@ def test_learning_rates(tmp_path, make_report):
             bests = {"Swimmer-v5": [shift + best for best in bests]}
             make_seeds(tmp_path, bests, depth, schedule, prefix=f"{rate}-", num_envs=4, learning_rate=rate)
     text, out = make_report(tmp_path), tmp_path / "report/6M"
-    rows = {row["method"]: row["best_mean"] for row in read(out / "learning_rates.csv")}
+    rows = {row["method"]: row["best_mean"] for row in read_csv(out / "learning_rates.csv")}
     assert (rows["PPO, lr x 1/3"], rows["PPO, lr x 1"], rows["PPO, lr x 3"]) == ("1.0", "1.0", "2.0")
     assert rows["RefinePPO K=4 uniform, lr x 3"] == "32.0"
-    differences = {
-        row["difference"]: row["best_difference_value"] for row in read(out / "learning_rates_differences.csv")
-    }
+    rows = read_csv(out / "learning_rates_differences.csv")
+    differences = {row["difference"]: row["best_difference_value"] for row in rows}
     assert len(differences) == 9
     for rate in ("1/3", "1", "3"):
         assert differences[f"RefinePPO K=4 average, lr x {rate} - PPO, lr x {rate}"] == "10.0"
@@ -329,7 +314,7 @@ def test_the_scripts_defaults_are_no_flags(tmp_path, script, make_report):
     config = json.loads((folder / "config.json").read_text()) | {"args": args}
     (folder / "config.json").write_text(json.dumps(config))
     make_report(tmp_path)
-    assert read(tmp_path / "report/runs.csv")[0]["flags"] == ""
+    assert read_csv(tmp_path / "report/runs.csv")[0]["flags"] == ""
 
 
 def test_the_same_run_with_other_numbers(tmp_path, make_report, capsys):
@@ -362,8 +347,8 @@ def test_runs_that_do_not_count_are_named(tmp_path, make_report, capsys):
     text = make_report(tmp_path)
     assert "- `failed`: a reward, global_step 4096, env 1\n" in text and "2 of 5 seeds of PPO: Hopper-v5" in text
     assert table(text, "Table 1")["Hopper-v5"][1] == "15.0 ± 7.1"
-    assert [row["run"] for row in read(tmp_path / "report/runs.csv") if row["failure"]] == ["failed", "at once"]
-    (row,) = read(tmp_path / "report/6M/cost.csv")
+    assert [row["run"] for row in read_csv(tmp_path / "report/runs.csv") if row["failure"]] == ["failed", "at once"]
+    (row,) = read_csv(tmp_path / "report/6M/cost.csv")
     assert (row["method"], row["runs"]) == ("PPO", "2") and float(row["hours"]) == pytest.approx(2 / 3600)
     said = capsys.readouterr().out.replace(f"{tmp_path}/", "").splitlines()
     assert sorted(":".join(line.split(":")[:2]) for line in said) == [
@@ -384,7 +369,7 @@ def test_another_number_of_steps_is_another_experiment(tmp_path, make_report):
     make_seeds(tmp_path, {"Hopper-v5": [7]}, prefix="short-", steps=8192)
     text = make_report(tmp_path)
     assert re.findall("^# (.*) steps$", text, re.MULTILINE) == ["1M", "6M", "8192"]
-    means = [read(tmp_path / f"report/{name}/table1.csv")[0]["ppo_mean"] for name in ("1M", "6M", "8192")]
+    means = [read_csv(tmp_path / f"report/{name}/table1.csv")[0]["ppo_mean"] for name in ("1M", "6M", "8192")]
     assert means == ["3.0", "20.0", "7.0"] and text.count("## Fig. 2") == 3
     assert table(text, "Is the baseline")["Hopper-v5"] == ["2000 ± 0", "2383 ± 272", "3"]
     assert text.count("Is the baseline a good PPO?") == 1
@@ -402,9 +387,9 @@ def test_variants(tmp_path, make_report):
     assert table(text, "Table 1")["Hopper-v5"][1:3] == ["20.0 ± 10.0", "45.0 ± 7.1"]  # --no-compile is of the machine
     assert "All runs have `eval-interval 50000`." in text
     assert "settings are those of\nboth, but not on Hopper-v5." in text
-    ppo, refined = read(tmp_path / "report/6M/settings.csv")
+    ppo, refined = read_csv(tmp_path / "report/6M/settings.csv")
     assert (ppo["flags"], refined["flags"]) == ("gamma 0.9", "no-anneal-lr")
-    rows = {row["method"]: row["best_mean"] for row in read(tmp_path / "report/6M/variants.csv")}
+    rows = {row["method"]: row["best_mean"] for row in read_csv(tmp_path / "report/6M/variants.csv")}
     refined = {"RefinePPO K=4 average": "1.5", "RefinePPO K=4 average seeds from 1001 on": "9.0"}
     assert rows == {"PPO": "20.0", "PPO default gamma": "1.5", **refined}
 
@@ -440,19 +425,8 @@ def test_a_run_and_a_seed_count_once(tmp_path, make_report):
 # --- Statistics against plain loops -----------------------------------------------------------------------------------
 
 
-def plain_iqm(scores) -> float:
-    cut = int(0.25 * len(scores))
-    return mean(sorted(scores)[cut : len(scores) - cut])
-
-
 def plain_probability(xs, ys) -> float:
     return mean(1 if x > y else 0.5 if x == y else 0 for x in xs for y in ys)
-
-
-def interval(values) -> list[float]:
-    """Quantiles of 2.5 and 97.5 %."""
-    fortieths = quantiles(values, n=40, method="inclusive")
-    return [fortieths[0], fortieths[-1]]
 
 
 @pytest.fixture
@@ -465,12 +439,13 @@ def strata(monkeypatch):
 def test_bootstrap_of_the_iqm(strata):
     """Resampled within each task, all tasks' scores trimmed together."""
     for n in range(1, 13):
-        assert report.iqm(np.arange(n) ** 2.0) == pytest.approx(plain_iqm(np.arange(n) ** 2.0))
+        assert report.iqm(np.arange(n) ** 2.0) == pytest.approx(trim_mean(np.arange(n) ** 2.0, 0.25))
     rng = np.random.default_rng(0)
     draws = [scores[rng.integers(len(scores), size=(300, len(scores)))] for scores in strata]
     value, *bounds = report.Estimate.iqm(strata)
-    assert value == pytest.approx(plain_iqm(np.concatenate(strata)))
-    assert bounds == pytest.approx(interval([plain_iqm(np.concatenate(drawn)) for drawn in zip(*draws)]))
+    assert value == pytest.approx(trim_mean(np.concatenate(strata), 0.25))
+    resampled = [trim_mean(np.concatenate(drawn), 0.25) for drawn in zip(*draws)]
+    assert bounds == pytest.approx(np.quantile(resampled, (0.025, 0.975)))
 
 
 def test_probability_of_improvement(strata):
@@ -481,7 +456,8 @@ def test_probability_of_improvement(strata):
         estimates = report.Estimate.iqm(lone), report.Estimate.pair(report.probability, strata, lone)
         assert np.isnan([x[1:] for x in estimates]).all()
     first, second = zip(*report.resample(strata, 1)), zip(*report.resample(others, 2))
-    assert bounds == pytest.approx(interval([mean(map(plain_probability, x, y)) for x, y in zip(first, second)]))
+    resampled = [mean(map(plain_probability, x, y)) for x, y in zip(first, second)]
+    assert bounds == pytest.approx(np.quantile(resampled, (0.025, 0.975)))
 
 
 def test_the_mean_curve_is_of_the_seeds_that_were_evaluated_there():
@@ -506,16 +482,6 @@ def make_runs_for_every_section(root: Path):
     make_run(root / "failed", "Ant-v5", 9, failure={"what": "a loss", "global_step": 7})
 
 
-def check_figure(path: Path):
-    """The picture opens, and neither is of one colour nor a dot on an empty page; its paper is white."""
-    pixels = matplotlib.image.imread(path)
-    assert min(pixels.shape[:2]) > 200 and (pixels[0, 0] == 1).all()
-    assert (pixels[..., :3].min(-1) < 0.9).mean() > 0.01
-    assert len(np.unique(pixels[..., :3].reshape(-1, 3), axis=0)) > 20
-    pdf = path.with_suffix(".pdf").read_bytes()
-    assert pdf.startswith(b"%PDF") and b"/CIDFontType2" in pdf and b"/Type3" not in pdf  # IEEE refuses Type 3
-
-
 @pytest.mark.slow
 def test_every_file_of_a_report(tmp_path):
     """Markdown, CSV and LaTeX of each table, PNG and PDF of each figure, all linked; the two tables make them again."""
@@ -524,20 +490,22 @@ def test_every_file_of_a_report(tmp_path):
     assert (done.returncode, done.stdout) == (0, "55 runs; the report is in runs/report/report.md\n"), done.stderr
     out = tmp_path / "runs/report"
     files, text = files_of(out), (out / "report.md").read_text()
-    assert {*re.findall(r"\]\(([\w./]+)\)", text)} == files.keys() - {"report.md"}
+    assert {*re.findall(r"\]\(([\w./]+)\)", text)} == files.keys() - {"report.md", "1M"}
     assert not re.search(r"\b(nan|inf|None)\b", text)
     tables = "table1 table2 depth depth_normalised sample_efficiency seeds aggregate selection baseline toy cost"
     tables += " controls controls_differences learning_rates learning_rates_differences variants variants_differences"
     figures = "training_curves training_curves_all depth seeds action_dimension controls learning_rates variants"
     expected = {f"1M/{name}.{kind}" for name in tables.split() for kind in ("csv", "tex")}
     expected |= {f"1M/{name}.{kind}" for name in figures.split() for kind in ("png", "pdf")}
-    assert files.keys() == expected | {"report.md", "runs.csv", "evaluations.csv"}
+    assert files.keys() == expected | {"1M", "report.md", "runs.csv", "evaluations.csv"}
     for name in figures.split():
-        check_figure(out / f"1M/{name}.png")
+        check_picture(out / f"1M/{name}.png")
+        pdf = files[f"1M/{name}.pdf"]
+        assert pdf.startswith(b"%PDF") and b"/CIDFontType2" in pdf and b"/Type3" not in pdf  # IEEE refuses Type 3
     markdown = [block.splitlines() for block in text.split("\n\n") if block.startswith("|")]
     for name, lines in zip(re.findall(r"\[(\w+)\.csv\]\(1M", text), markdown):
         latex = [line for line in (out / f"1M/{name}.tex").read_text().splitlines() if line.endswith(r" \\")]
-        assert len(read(out / f"1M/{name}.csv")) == len(lines) - 2 == len(latex) - 1
+        assert len(read_csv(out / f"1M/{name}.csv")) == len(lines) - 2 == len(latex) - 1
         (bars,) = {line.count("|") for line in lines}
         assert {len(re.findall(r"(?<!\\)&", row)) for row in latex} == {bars - 2}
         assert not re.search(r"(?<!\\)[%_#]|±|(?<![\w{$])-\d", "".join(latex))
@@ -560,11 +528,11 @@ def test_a_report_in_the_folder_of_its_runs(tmp_path, make_report):
     (tmp_path / "6M/.DS_Store").touch()
     make_run(tmp_path / "third", "Hopper-v5", 3, 30)
     make_report(tmp_path)
-    assert len(read(tmp_path / "runs.csv")) == 4 and (tmp_path / "6M/toy.csv").exists()
+    assert len(read_csv(tmp_path / "runs.csv")) == 4 and (tmp_path / "6M/toy.csv").exists()
     for name in ("runs.csv", "evaluations.csv", "toy/result.json"):
         (tmp_path / name).unlink()
     make_report(tmp_path, *out)
-    assert len(read(tmp_path / "runs.csv")) == 3 and not (tmp_path / "6M/toy.csv").exists()
+    assert len(read_csv(tmp_path / "runs.csv")) == 3 and not (tmp_path / "6M/toy.csv").exists()
     assert (tmp_path / "notes.md").read_text() == "mine"
 
 

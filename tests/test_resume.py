@@ -11,6 +11,7 @@ import filelock
 import numpy as np
 import pytest
 import torch
+from conftest import wait_until
 from resume_helpers import KILLED, TASKS, Run, ends_with, finish_exactly, flags, interrupt, outcome, refusal, send
 from test_commands import call_main
 from tqdm import tqdm
@@ -245,7 +246,7 @@ def test_two_processes_in_one_folder(script, killed):
     """The lock of a process that was killed does not block."""
     run_dir, words = killed
     first = Run(script, words, at=("rollout = collect(", 1), action=lambda: time.sleep(60))
-    first.wait_until(lambda: len(list(run_dir.glob("events*"))) == 2)
+    wait_until(lambda: len(list(run_dir.glob("events*"))) == 2)
     assert "another process" in refusal(script, words)
     os.kill(first.process.pid, signal.SIGKILL)
     first.wait()

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import run
+from conftest import files_of, run
 from resume_helpers import differences, outcome
 from test_commands import QUICK, call_main, read_events, read_json
 
@@ -51,7 +51,7 @@ def test_same_numbers_in_another_process(script, tmp_path):
     assert differences(one, other) == []
     assert {"last.pt/params/log_std", "evaluations.csv", "result.json/best/mean", "losses/approx_kl"} <= one.keys()
 
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    before = files_of(tmp_path)
     for name in ("best", "last"):
         final = read_json(tmp_path / "here/result.json")[name]
         checkpoint = tmp_path / f"here/{name}.pt"
@@ -59,7 +59,7 @@ def test_same_numbers_in_another_process(script, tmp_path):
         assert done.returncode == 0 and done.stderr == ""
         assert re.findall(r"return (\S+), length \d+\n", done.stdout) == [f"{x:.3f}" for x in final["returns"]]
         assert f"mean return {final['mean']:.3f}, std {final['std']:.3f}" in done.stdout
-    assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert before == files_of(tmp_path)
 
 
 def test_another_seed_other_numbers(script, tmp_path):

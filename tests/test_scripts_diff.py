@@ -48,11 +48,9 @@ def test_scripts_differ_as_the_page_says():
 
 
 def test_page_by_hand():
-    ppo = "# a\nimport a\n\n\nclass A:\n    x = 1\n\n    def f(self):\n        return 2\n\n\nprint(1)\n"
-    refineppo = (
-        "# b\nimport a\n\nclass A:\n    x = 3\n\n    @property\n    def f(self):\n\n        return 4\n\nprint(1)\n"
-    )
-    assert page(ppo, refineppo).splitlines()[2:] == [
+    old = "# a\nimport a\n\n\nclass A:\n    x = 1\n\n    def f(self):\n        return 2\n\n\nprint(1)\n"
+    new = "# b\nimport a\n\nclass A:\n    x = 3\n\n    @property\n    def f(self):\n\n        return 4\n\nprint(1)\n"
+    assert page(old, new).splitlines()[2:] == [
         *("", "# the module", "-# a", "+# b"),
         *("", "# A", "-    x = 1", "+    x = 3"),
         *("", "# A.f", "+    @property", "-        return 2", "+        return 4"),

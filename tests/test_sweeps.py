@@ -17,10 +17,9 @@ from pathlib import Path
 import gymnasium as gym
 import jobs
 import pytest
-import torch
 import tyro
-from conftest import ROOT
-from resume_helpers import TASKS
+from conftest import ROOT, wait_until
+from resume_helpers import TASKS, differences, outcome
 
 import ppo_continuous
 import refineppo_continuous
@@ -76,18 +75,14 @@ def method(args) -> str:
 
 # --- Generators -------------------------------------------------------------------------------------------------------
 
+TOY = "sweeps.toy_env:Coordination-v0"
 CONTROLS = "HalfCheetah-v5 Pusher-v5 Hopper-v5 HumanoidStandup-v5 Swimmer-v5".split()
 SWEEPS = [  # steps, tasks, methods
     ("benchmark.sh", 6_000_000, TASKS, "ppo-2x128 K4-average"),
     ("depth.sh", 6_000_000, TASKS, "K1-average K2-average K4-average K8-average"),
     ("schedule.sh", 6_000_000, MUJOCO, "K4-average K4-uniform K4-inverse"),
     ("controls.sh", 1_000_000, CONTROLS, "K1-average K2-average K8-average K4-uniform K4-inverse ppo-5x128 ppo-2x256"),
-    (
-        "toy.sh",
-        50_000,
-        ["sweeps.toy_env:Coordination-v0"],
-        "ppo-2x128 K1-average K1-uniform K2-average K2-uniform K4-average K4-uniform",
-    ),
+    ("toy.sh", 50_000, [TOY], "ppo-2x128 K1-average K1-uniform K2-average K2-uniform K4-average K4-uniform"),
 ]
 
 
@@ -244,7 +239,7 @@ def test_shellcheck(tmp_path):
 
 
 def test_toy_environment():
-    env = gym.make("sweeps.toy_env:Coordination-v0")
+    env = gym.make(TOY)
     for off, reward in ((0, 0), (0.3, -0.18)):  # both components are off
         (s,), _ = env.reset(seed=3)
         action = [phi(s) + off, psi(s, phi(s)) - off]
@@ -345,13 +340,6 @@ def tiny_sweep(folder: Path) -> tuple[list[str], Path]:
     return [long, *lines[1:], "python no_such_script.py --run-dir runs/broken"], Path(parse(long).run_dir)
 
 
-def wait_until(condition, timeout=300, pause=0.05):
-    end = time.time() + timeout
-    while not condition():
-        assert time.time() < end, "it did not happen in time"
-        time.sleep(pause)
-
-
 def training_of(run_dir: Path) -> int | None:
     """The process that trains in the folder."""
     for process in Path("/proc").glob("[0-9]*"):
@@ -372,13 +360,6 @@ def saves(run_dir: Path) -> int:
     return (run_dir / "last.pt").stat().st_mtime_ns if (run_dir / "last.pt").exists() else 0
 
 
-def outcome(run_dir: Path) -> tuple[dict, dict, str]:
-    """A run's last parameters, its result without what a clock measured, and its evaluations."""
-    result = json.loads((run_dir / "result.json").read_text()) | {"wall_time_s": None, "sps": None}
-    params = torch.load(run_dir / "last.pt", weights_only=True)["params"]
-    return {name: values.tolist() for name, values in params.items()}, result, (run_dir / "evaluations.csv").read_text()
-
-
 def check_tiny_sweep(folder: Path, lines: list[str], long: Path):
     """Every run is complete, and the interrupted one is what it would have been without."""
     for line in lines[:-1]:
@@ -386,7 +367,7 @@ def check_tiny_sweep(folder: Path, lines: list[str], long: Path):
         assert (result["seed"], result["total_timesteps"]) == (parse(line).seed, parse(line).total_timesteps)
     alone = lines[0].replace("--run-dir runs", "--run-dir alone")
     subprocess.run(shlex.split(alone), cwd=folder, env=environment(folder), check=True, capture_output=True)
-    assert outcome(folder / long) == outcome(folder / "alone" / long.name)
+    assert differences(outcome(folder / long), outcome(folder / "alone" / long.name)) == []
 
 
 @pytest.mark.slow

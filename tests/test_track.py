@@ -7,13 +7,12 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ROOT, run
+from conftest import ROOT, run, wait_until
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_commands import read_json
 
@@ -63,13 +62,12 @@ def in_tensorboard(folder: Path) -> Counter:
 
 def start(folder: Path, *flags) -> subprocess.Popen:
     """A training, after two evaluations."""
-    out, deadline = folder / "out", time.monotonic() + 300
+    out = folder / "out"
     with out.open("w") as file:
         command = [sys.executable, ROOT / SCRIPT, *FLAGS, *flags]
         process = subprocess.Popen(command, cwd=folder, stdout=file, stderr=subprocess.STDOUT)
-    while out.read_text().count("evaluation return") < 2:
-        assert process.poll() is None and time.monotonic() < deadline, out.read_text()
-        time.sleep(0.02)
+    wait_until(lambda: process.poll() is not None or out.read_text().count("evaluation return") >= 2, pause=0.02)
+    assert process.poll() is None, out.read_text()
     return process
 
 

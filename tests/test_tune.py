@@ -4,11 +4,11 @@ Most of it runs `sweeps/tune.py` beside a stand-in for the training scripts, sta
 last. The tests on PostgreSQL need the URL of an empty database in REFINEPPO_TEST_POSTGRES.
 """
 
-import csv
 import fcntl
 import json
 import math
 import os
+import pickle
 import re
 import shlex
 import shutil
@@ -17,17 +17,18 @@ import subprocess
 import sys
 import uuid
 from collections import Counter
+from dataclasses import fields
 from pathlib import Path
 
 import optuna
 import pytest
 import space
-import tune
 import tyro
-from conftest import ROOT, python, run
+from conftest import ROOT, python, read_csv, run, wait_until
 from flags import default_args
-from test_sweeps import parent, wait_until
+from test_sweeps import parent
 
+import ppo_continuous
 import refineppo_continuous
 
 pytestmark = pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")
@@ -42,19 +43,16 @@ def flags_of(row: dict) -> dict:
     return {name: read[type(DEFAULT[name])](row[name]) for name in names}
 
 
-def read_csv(path: Path) -> list[dict]:
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
-
-
 class Place:
     """A copy of the tuner beside stand-ins for the training scripts, and a folder to work in."""
 
     def __init__(self, path: Path):
         self.path, self.workers = path, []
         shutil.copytree(ROOT / "sweeps", path / "sweeps", ignore=shutil.ignore_patterns("results"))
-        for name in ("ppo_continuous.py", "refineppo_continuous.py"):
-            shutil.copy(ROOT / "tests" / "stand_in_training.py", path / name)
+        for script in (ppo_continuous, refineppo_continuous):
+            shutil.copy(ROOT / "tests" / "stand_in_training.py", path / f"{script.__name__}.py")
+            args = [(field.name, field.type, field.default) for field in fields(script.Args)]
+            (path / f"{script.__name__}.pickle").write_bytes(pickle.dumps(args))
 
     def begin(self, *flags, **env) -> subprocess.Popen:
         """A worker in the background."""
@@ -131,15 +129,8 @@ def test_the_default_comes_first_and_then_what_was_published(script):
     """Exactly so: Swimmer's as RL Baselines3 Zoo has them."""
     (_, default), (source, published) = first_settings("Swimmer-v5")
     assert source == "published" and default == {name: DEFAULT[name] for name in space.FLAGS}
-    assert published == default | {
-        "learning_rate": 6e-4,
-        "anneal_lr": False,
-        "num_envs": 4,
-        "num_steps": 1024,
-        "num_minibatches": 16,  # of 256
-        "gamma": 0.9999,
-        "gae_lambda": 0.98,
-    }
+    swimmer = dict(learning_rate=6e-4, anneal_lr=False, gamma=0.9999, gae_lambda=0.98)
+    assert published == default | swimmer | dict(num_envs=4, num_steps=1024, num_minibatches=16)  # of 256
     assert [source for source, _ in first_settings("probe_envs:Counter-v0")] == ["default"]
     tasks = [path.stem for path in space.PUBLISHED.glob("*.args")]
     assert len(tasks) == 14
@@ -250,27 +241,6 @@ def test_a_fixed_depth_is_an_arm_of_its_own(place):
     assert not (place.path / "runs/tune/settings").exists()
 
 
-def test_a_surplus_attempt_is_given_back(tmp_path):
-    """Two workers queue the same trial, and three ask for it."""
-    worker = tune.Worker(tune.Args("ppo", "HalfCheetah-v5", trials=1, out_dir=tmp_path))
-    worker.open_study()
-    worker.queue(0, {})
-    worker.queue(0, {})
-    first, *others = (worker.study.ask() for _ in range(3))
-    for surplus in others:
-        with pytest.raises(tune.PutBack):
-            worker.evaluate(surplus)
-        worker.study.tell(surplus, state=tune.TrialState.FAIL)
-    worker.fill_queue()  # changes nothing: the first attempt has just begun
-    assert [tune.state(attempt) for attempt in worker.study.get_trials()] == ["running", "surplus", "surplus"]
-    worker.study.tell(first, state=tune.TrialState.FAIL)
-    worker.fill_queue()
-    worker.fill_queue()
-    attempts = worker.study.get_trials()
-    assert [tune.state(attempt) for attempt in attempts] == ["put back", "surplus", "surplus", "waiting"]
-    assert tune.number(attempts[-1]) == 0 and attempts[-1].params == attempts[0].params
-
-
 def test_a_later_call_with_more_trials_continues(place):
     assert "trial 0 (default) of 1 is best" in place.tune("--trials", 1)
     assert (place.path / "runs/tune/settings/ppo/HalfCheetah-v5.args").read_text().count("\n--") == 0  # the default
@@ -302,15 +272,6 @@ def test_a_signal_puts_the_trials_back(place, signum, workers):
     place.tune("--trials", 2, STEPS="100")
     place.check_books(trials=2, steps=100)
     assert [row["state"] for row in place.rows()].count("put back") == workers
-
-
-@pytest.mark.slow
-def test_a_signal_while_the_budget_is_stated(place):
-    """No further worker begins."""
-    worker = place.begin("--trials", 2, "--workers", 2, STEPS="100")
-    wait_until(Path(f"/proc/{worker.pid}/task/{worker.pid}/children").read_text)
-    worker.send_signal(signal.SIGINT)
-    assert "stopped by SIGINT" in place.end(worker, code=75) and place.steps() == {}
 
 
 @pytest.mark.slow

@@ -44,11 +44,8 @@ def with_our_names(eager: Agent) -> dict[str, torch.Tensor]:
 
 def eager_copy(agent) -> Agent:
     """The reference's agent with the same parameters."""
-    args = agent.args
-    K, schedule = getattr(args, "refinement_depth", None), getattr(args, "refinement_schedule", "")
     obs_dim, action_dim = len(agent.params["critic.0.weight"]), len(agent.params["log_std"])
-    eager = Agent(obs_dim, action_dim, K, schedule, args.actor_hidden, args.critic_hidden)
-    eager = eager.to(agent.params["log_std"].dtype)
+    eager = Agent(obs_dim, action_dim, agent.args).to(agent.params["log_std"].dtype)
     with torch.no_grad():
         for name, p in with_our_names(eager).items():
             p.copy_(agent.params[name])
