@@ -1,7 +1,6 @@
 """What refinement does in a trained policy, from its checkpoints: the paper's two analyses, and what follows from them.
 
     python analysis_refinement.py --checkpoint runs/.../best.pt
-    python analysis_refinement.py --checkpoint runs/seed-*/best.pt --sections settling r2 feedback
     python analysis_refinement.py --checkpoint runs/.../step_*.pt --sections training
 
     settling  how far each action component still is from its end after k steps: e_{k,j}, figure 3a of the paper
@@ -39,9 +38,9 @@ import pandas as pd
 import sklearn
 import torch
 import tyro
-from matplotlib import colormaps, rc_context
-from matplotlib.colors import Normalize
+from matplotlib import colormaps, colors, rc_context
 from matplotlib.figure import Figure
+from PIL import Image
 from sklearn import linear_model, metrics, model_selection, pipeline, preprocessing
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.neural_network import MLPRegressor
@@ -549,7 +548,7 @@ class Figures:
             across = across_seeds(rows[["checkpoint", *keys, value]], keys)
             panels["mean over seeds"] = compact(across, keys, "at", f"{value}_mean")
             panels["std over seeds"] = compact(across[across["seeds"] > 1], keys, "at", f"{value}_std")
-        columns, norm = rows["at"].unique(), Normalize(min(0.0, rows[value].min()), rows[value].max())
+        columns, norm = rows["at"].unique(), colors.Normalize(min(0.0, rows[value].min()), rows[value].max())
         width, height, titles = width * len(columns) + 0.2, 0.17 * len(names) + 0.6, [""] if self.single else panels
         figure, axes = self.axes(what, titles, max(1, int(8 / width)), width, height, sharey=True)
         for axis, panel in zip(axes, panels.values()):
@@ -661,13 +660,14 @@ class Figures:
 
 
 def as_png(figure: Figure) -> bytes:
-    """The picture, with one legend below all axes."""
+    """The picture in 256 colours, a third of the bytes, with one legend below all axes."""
     lines, names = figure.axes[-1].get_legend_handles_labels()  # it has all; a run may lack its learning curve
     if len(names) > 1:
         columns = max(1, int(figure.get_figwidth() / (0.6 + 0.05 * max(map(len, names)))))
         figure.legend(lines, names, loc="outside lower center", ncols=columns, frameon=False)
-    image = io.BytesIO()
-    figure.savefig(image, format="png")
+    drawn, image = io.BytesIO(), io.BytesIO()
+    figure.savefig(drawn, format="png")
+    Image.open(drawn).convert("RGB").quantize(method=Image.Quantize.MAXCOVERAGE).save(image, "png")
     return image.getvalue()
 
 

@@ -35,7 +35,7 @@ import jinja2
 import numpy as np
 import pandas as pd
 import tyro
-from common import refuse, steps_text
+from common import palette_png, refuse, steps_text
 from flags import words
 from matplotlib import rc_context
 from matplotlib.figure import Figure
@@ -291,7 +291,7 @@ class Report:
         png, pdf = io.BytesIO(), io.BytesIO()
         figure.savefig(png, format="png")
         figure.savefig(pdf, format="pdf", metadata={"CreationDate": None})
-        links = self.add(f"{name}.png", png.getvalue()), self.add(f"{name}.pdf", pdf.getvalue())
+        links = self.add(f"{name}.png", palette_png(png)), self.add(f"{name}.pdf", pdf.getvalue())
         self.blocks[f"{name}_figure"] = "!{}\n\n{}".format(*links)
 
 
