@@ -229,6 +229,9 @@ def task(path: Path):
         if code == EXIT_STOPPED:
             if signal.SIGTERM not in signals:
                 subprocess.run(["scontrol", "requeue", f"{os.environ['SLURM_ARRAY_JOB_ID']}_{element}"], check=True)
+                end = time.time() + 60  # till Slurm ends it with TERM: one that ends before may be taken for failed
+                while signal.SIGTERM not in signals and time.time() < end:
+                    time.sleep(0.5)
             raise SystemExit(EXIT_STOPPED)
     raise SystemExit(1 if "failed" in words else 0)
 

@@ -464,5 +464,7 @@ def test_a_slurm_sweep_is_preempted_requeued_and_finished(tmp_path):
     wait_until(lambda: hurry() and not queued(), pause=1)
     assert [state(f"{job}_{i}") for i in range(1, 8)] == ["COMPLETED"] * 6 + ["FAILED"]
     assert joblog(tmp_path)[lines[0]][-1] == 0 and joblog(tmp_path)[lines[-1]] == [2]
-    assert "failed (exit 2): runs/broken.log" in (tmp_path / "runs" / "slurm" / f"{job}_7.log").read_text()
+    first, last = ((tmp_path / "runs" / "slurm" / f"{job}_{i}.log").read_text() for i in (1, 7))
+    assert "DUE TO JOB REQUEUE" in first  # it waits for that, since Slurm takes a job that ends before for failed
+    assert "failed (exit 2): runs/broken.log" in last
     check_tiny_sweep(tmp_path, lines, long)
