@@ -521,11 +521,11 @@ class Figures:
         labels = {str(p.path): p.label if labels.count(p.label) == 1 else str(p.path) for p in policies}
         self.tables = {name: rows.assign(line=rows["checkpoint"].map(labels)) for name, rows in tables.items()}
         self.policies, self.episodes, self.depth = policies, args.episodes, policies[0].args.refinement_depth
-        self.single = len(policies) == 1
-        self.seeds = len({policy.args.seed for policy in policies}) == len(policies) > 1
+        self.single, seeds = len(policies) == 1, {policy.args.seed for policy in policies}
+        self.seeds = len(seeds) == len(policies) > 1
         self.schedule = policies[0].args.refinement_schedule
         self.title = f"{policies[0].args.env_id}, $K = {self.depth}$, {self.schedule} schedule"
-        self.title += f", {policies[0].label}" if self.single else ""
+        self.title += f", {policies[0].label}" if self.single else f", seed {min(seeds)}" if len(seeds) == 1 else ""
 
     def axes(self, what: str, titles: list[str], columns: int, width: float, height: float, **share):
         """A titled figure and its titled axes, at most `columns` in a row, each of width x height inches."""

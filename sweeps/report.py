@@ -74,7 +74,7 @@ class Args:
     schedule: Literal["average", "uniform", "inverse"] = "average"
     """refinement schedule that stands for RefinePPO"""
     curve_tasks: tuple[str, ...] = CURVE_TASKS
-    """tasks in the figure training_curves; training_curves_all has all"""
+    """tasks in the figure training_curves, where one has no run another; training_curves_all has all"""
 
 
 # --- Runs -------------------------------------------------------------------------------------------------------------
@@ -343,7 +343,7 @@ def training_curves(e: Experiment, report: Report):
     curves = {task: pair for task, pair in curves.items() if any(pair)}
     if not curves:
         return
-    tasks = [task for task in e.args.curve_tasks if task in curves] or [*curves][:6]
+    tasks = [*dict.fromkeys(x for x in (*e.args.curve_tasks, *curves) if x in curves)][: len(e.args.curve_tasks)]
     report.facts["no_curve"] = [task for task in e.args.curve_tasks if task not in curves]
     report.figure("training_curves", curves_figure({task: curves[task] for task in tasks}))
     if curves.keys() - {*tasks}:
