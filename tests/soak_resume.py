@@ -30,21 +30,13 @@ def random_settings(rng: random.Random) -> dict:
     """A small run's settings; every choice is one that resume must not depend on."""
     num_envs, num_steps = rng.choice((1, 1, 2, 3, 8, 17)), rng.choice((32, 64, 96, 200))
     batch = num_envs * num_steps
-    settings = {
-        "env_id": rng.choice(TASKS),
-        "seed": rng.randrange(1000),
-        "num_envs": num_envs,
-        "num_steps": num_steps,
-        "num_minibatches": rng.choice((1, 4, 8)),
-        "total_timesteps": batch * rng.randint(4, 16) + rng.randrange(batch),
-        "eval_interval": batch * rng.randint(2, 6),
-        "checkpoint_interval": batch * rng.choice((1, 1, 2, 3)),
-        "save_every": batch * rng.choice((2, 100, 100)),
-        "max_episode_steps": rng.choice((30, 100, 300)),
-        "actor_hidden": rng.choice((16, 64)),
-        "compile": rng.random() < 0.1,
-        "target_kl": rng.choice((0.01, 1e9, 1e9, 1e9)),
-    }
+    settings = dict(env_id=rng.choice(TASKS), seed=rng.randrange(1000), num_envs=num_envs, num_steps=num_steps)
+    settings |= dict(num_minibatches=rng.choice((1, 4, 8)))
+    settings |= dict(total_timesteps=batch * rng.randint(4, 16) + rng.randrange(batch))
+    settings |= dict(eval_interval=batch * rng.randint(2, 6), checkpoint_interval=batch * rng.choice((1, 1, 2, 3)))
+    settings |= dict(save_every=batch * rng.choice((2, 100, 100)), max_episode_steps=rng.choice((30, 100, 300)))
+    settings |= dict(actor_hidden=rng.choice((16, 64)), compile=rng.random() < 0.1)
+    settings |= dict(target_kl=rng.choice((0.01, 1e9, 1e9, 1e9)))
     switches = "anneal_lr norm_adv clip_vloss bootstrap_truncated normalize_obs normalize_reward".split()
     return settings | {switch: rng.random() < 0.5 for switch in switches}
 

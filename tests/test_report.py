@@ -6,14 +6,14 @@ import re
 import shutil
 import sys
 from pathlib import Path
-from statistics import mean, stdev
+from statistics import mean, quantiles, stdev
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from conftest import ROOT, check_picture, files_of, read_csv, run
-from scipy.stats import trim_mean
 
-from sweeps import report
+from sweeps import bounds, report
 
 TOY = "sweeps.toy_env:Coordination-v0"
 CURVE, STEPS = ((100, 0.0), (200, 1.0)), 6_000_000
@@ -78,6 +78,43 @@ def table(text: str, header: str) -> dict[str, list[str]]:
 
 PAPER, BOUNDS = (read_csv(ROOT / "sweeps" / name) for name in ("paper_results.csv", "bounds.csv"))
 LIMITS = {row["task"]: (float(row["random_return"]), float(row["reference_return"])) for row in BOUNDS}
+
+
+# --- The paper's numbers and the bounds, against Gymnasium and the random policy run again ----------------------------
+
+
+def test_the_papers_numbers():
+    """Its improvements follow from its returns, and its two tables agree."""
+    means = {(row["table"], row["task"], row["method"], row["schedule"]): float(row["mean"]) for row in PAPER}
+    assert len(PAPER) == len(means) == 14 * 2 + 9 * 3
+    assert means["2", "HumanoidStandup-v5", "RefinePPO", "inverse"] == 147769.1
+    for row in PAPER:
+        assert gym.make(row["task"]).action_space.shape == (int(row["action_dim"]),)
+        if row["table"] == "1" and row["method"] == "RefinePPO":
+            ppo, refined = means["1", row["task"], "PPO", ""], float(row["mean"])
+            assert 100 * (refined - ppo) / abs(ppo) == pytest.approx(float(row["improvement_percent"]), abs=0.0501)
+            average = means.get(("2", row["task"], "RefinePPO", "average"), refined)
+            assert average == pytest.approx(refined, abs=0.81)  # Pusher: -37 there, -37.8 here
+
+
+def test_the_bounds():
+    """The tasks of Table 1, Gymnasium's thresholds where they count, and the random policy over 100 whole episodes."""
+    assert [row["task"] for row in BOUNDS] == [row["task"] for row in PAPER if row["table"] == "1"][::2]
+    rows = {row["task"]: row for row in BOUNDS}
+    others = {"Walker2d-v5": 5810, "Humanoid-v5": 3060, "HumanoidStandup-v5": 165067, "Pusher-v5": -37}
+    others["Pendulum-v1"] = -230.42
+    for task, row in rows.items():
+        assert gym.make(task).observation_space.shape == (int(row["obs_dim"]),)
+        reference = others.get(task) or gym.spec(task).reward_threshold
+        assert float(row["random_return"]) < float(row["reference_return"]) == reference
+    returns, saved = bounds.random_returns("Reacher-v5", 100, seed=0), rows["Reacher-v5"]
+    assert returns.mean() == pytest.approx(float(saved["random_return"]), rel=1e-5)
+    assert returns.std(ddof=1) == pytest.approx(float(saved["random_std"]), rel=1e-5)
+    env, others = gym.make("Reacher-v5"), []
+    for seed in range(100):
+        env.reset(seed=seed)
+        others.append(sum(env.step(env.action_space.sample())[1] for _ in range(50)))
+    assert mean(others) == pytest.approx(returns.mean(), abs=5 * stdev(others) * (2 / 100) ** 0.5)
 
 
 # --- Tables by hand ---------------------------------------------------------------------------------------------------
@@ -425,8 +462,19 @@ def test_a_run_and_a_seed_count_once(tmp_path, make_report):
 # --- Statistics against plain loops -----------------------------------------------------------------------------------
 
 
+def plain_iqm(scores) -> float:
+    cut = int(0.25 * len(scores))
+    return mean(sorted(scores)[cut : len(scores) - cut])
+
+
 def plain_probability(xs, ys) -> float:
     return mean(1 if x > y else 0.5 if x == y else 0 for x in xs for y in ys)
+
+
+def interval(values) -> list[float]:
+    """Quantiles of 2.5 and 97.5 %."""
+    fortieths = quantiles(values, n=40, method="inclusive")
+    return [fortieths[0], fortieths[-1]]
 
 
 @pytest.fixture
@@ -439,13 +487,12 @@ def strata(monkeypatch):
 def test_bootstrap_of_the_iqm(strata):
     """Resampled within each task, all tasks' scores trimmed together."""
     for n in range(1, 13):
-        assert report.iqm(np.arange(n) ** 2.0) == pytest.approx(trim_mean(np.arange(n) ** 2.0, 0.25))
+        assert report.iqm(np.arange(n) ** 2.0) == pytest.approx(plain_iqm(np.arange(n) ** 2.0))
     rng = np.random.default_rng(0)
     draws = [scores[rng.integers(len(scores), size=(300, len(scores)))] for scores in strata]
     value, *bounds = report.Estimate.iqm(strata)
-    assert value == pytest.approx(trim_mean(np.concatenate(strata), 0.25))
-    resampled = [trim_mean(np.concatenate(drawn), 0.25) for drawn in zip(*draws)]
-    assert bounds == pytest.approx(np.quantile(resampled, (0.025, 0.975)))
+    assert value == pytest.approx(plain_iqm(np.concatenate(strata)))
+    assert bounds == pytest.approx(interval([plain_iqm(np.concatenate(drawn)) for drawn in zip(*draws)]))
 
 
 def test_probability_of_improvement(strata):
@@ -456,8 +503,7 @@ def test_probability_of_improvement(strata):
         estimates = report.Estimate.iqm(lone), report.Estimate.pair(report.probability, strata, lone)
         assert np.isnan([x[1:] for x in estimates]).all()
     first, second = zip(*report.resample(strata, 1)), zip(*report.resample(others, 2))
-    resampled = [mean(map(plain_probability, x, y)) for x, y in zip(first, second)]
-    assert bounds == pytest.approx(np.quantile(resampled, (0.025, 0.975)))
+    assert bounds == pytest.approx(interval([mean(map(plain_probability, x, y)) for x, y in zip(first, second)]))
 
 
 def test_the_mean_curve_is_of_the_seeds_that_were_evaluated_there():
