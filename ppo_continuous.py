@@ -1141,13 +1141,15 @@ def describe_machine() -> dict:
     """Versions, commit and hardware: what the numbers of a run may depend on beside its flags."""
     git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
     commit = subprocess.run(git, capture_output=True, text=True).stdout.strip() if shutil.which("git") else ""
-    info = Path("/proc/cpuinfo").read_text() if sys.platform == "linux" else ""
-    cpu = next((line.split(": ")[1] for line in info.splitlines() if "model name" in line), platform.processor())
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if sys.platform == "linux" else []
+    info = dict(map(str.strip, line.split(":", 1)) for line in lines if ":" in line)
+    # Generations of one name may round differently: family and model (x86) or part (ARM) tell them apart
+    kind = [info[name] for name in ("model name", "cpu family", "model", "CPU part") if name in info]
     versions = {name: version(name) for name in ("torch", "numpy", "gymnasium", "mujoco", "box2d")}
     return {
         "versions": {"python": platform.python_version(), **versions},
         "git_commit": commit or None,
-        "cpu": f"{cpu} ({torch.backends.cpu.get_cpu_capability()})",  # generations of one name may round differently
+        "cpu": f"{', '.join(kind) or platform.processor()} ({torch.backends.cpu.get_cpu_capability()})",
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }
 

@@ -6,6 +6,7 @@ import inspect
 import json
 import re
 import signal
+import subprocess
 import sys
 import tomllib
 from dataclasses import fields
@@ -36,8 +37,7 @@ REFINEMENT = {f"refinement/{name}_{k}" for name in REFINEMENT for k in (1, 2, 3,
 
 def call_main(script, *flags):
     """`main()` in this process, as with these flags on the command line; signals and torch are then as before."""
-    numbers = signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, signal.SIGHUP
-    handlers = {number: signal.getsignal(number) for number in numbers}
+    handlers = {n: signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, signal.SIGHUP)}
     try:
         with mock.patch.object(sys, "argv", [script.__file__, *map(str, flags)]):
             script.main()
@@ -68,6 +68,8 @@ def check_config(run_dir: Path, script, env_id: str):
     assert set(config["args"]) == flag_names(script) and config["args"]["env_id"] == env_id
     assert config["versions"].items() >= {"torch": torch.__version__, "gymnasium": gym.__version__}.items()
     assert {"python", "numpy", "mujoco"} <= set(config["versions"]) and {"git_commit", "cpu", "gpu"} <= set(config)
+    x86 = re.search(r"Model name: +(.+)\s+CPU family: +(.+)\s+Model: +(.+)", subprocess.getoutput("lscpu"))
+    assert x86 is None or config["cpu"].startswith(", ".join(x86.groups()) + " (")  # None: ARM, or no lscpu
 
 
 def check_result(run_dir: Path, script, env_id: str, total: int):
