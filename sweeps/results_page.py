@@ -1,14 +1,17 @@
 """Write the tables of sweeps/results/README.md anew from the CSVs beside it: python sweeps/results_page.py
 
-The returns are those of benchmark/1M, what f reads of analysis/*/feedback.csv. A table is known by its first line.
+The returns and the controls are those of benchmark/1M, what f reads of analysis/*/feedback.csv. A table is known by the
+beginning of its first line.
 """
+
+from itertools import groupby
 
 import pandas as pd
 from common import ROOT
 from report import Estimate, Spread, shown
 
 RESULTS, TABLES = ROOT / "sweeps" / "results", ROOT / "sweeps" / "results" / "benchmark" / "1M"
-SELECTIONS, METHODS = ("best", "last", "last_10_percent"), ("ppo", "refineppo")
+SELECTIONS, METHODS = {"best": "best", "last": "last", "last_10_percent": "last 10 %"}, ("ppo", "refineppo")
 
 
 def returns() -> list[list[str]]:
@@ -21,31 +24,52 @@ def returns() -> list[list[str]]:
     over_all = pd.read_csv(TABLES / "aggregate.csv")
     iqm = [estimate(row, f"{method}_iqm") for method in METHODS for _, row in over_all.iterrows()]
     wins = [estimate(row, "p_improvement") for _, row in over_all.iterrows()]
-    return [*rows, ["all: IQM, normalised", *iqm], ["all: RefinePPO wins", "", "", "", *wins]]
+    head = ["task", "PPO: best", "last", "last 10 %", "RefinePPO: best", "last", "last 10 %"]
+    return [head, *rows, ["all: IQM, normalised", *iqm], ["all: RefinePPO wins", "", "", "", *wins]]
 
 
 def estimate(row: pd.Series, name: str) -> str:
     return str(Estimate(*(row[f"{name}_{part}"] for part in Estimate._fields)))
 
 
+def controls() -> list[list[str]]:
+    """A column for each control: over its tasks, the share of the pairs of seeds in which it is better than PPO."""
+    table = pd.read_csv(TABLES / "controls_differences.csv")
+    table = table[table.difference.str.endswith(" - PPO") & table.task.str.endswith("normalised")]
+    names = table.difference.str.removesuffix(" - PPO").str.removeprefix("RefinePPO ").str.removesuffix(" average")
+    rows = [
+        [name, *(estimate(row, f"{selection}_p_higher") for _, row in table.iterrows())]
+        for selection, name in SELECTIONS.items()
+    ]
+    return [["P(higher than PPO)", *names], ["tasks", *table.task.str.split().str[0]], *rows]
+
+
 def feedback() -> list[list[str]]:
-    """A row for each task: the own return; what is lost, with its standard error; R^2 of the network of one pass."""
+    """A row for each task and budget, of several seeds in one: the own return; what is lost, with its standard error;
+    R^2 of the network of one pass."""
     rows = []
     for path in sorted(RESULTS.glob("analysis/*/feedback.csv")):
         reads = {row.pop("reads"): row for row in pd.read_csv(path).to_dict("records")}
         lost = [reads[x] for x in ("zero", "another_state", "one_pass")]
         lost = [str(Spread(x["lost_mean"], x["lost_std"] / x["episodes"] ** 0.5)) for x in lost]
-        rows.append([path.parent.name, shown(reads["own"]["return_mean"]), *lost, f"{reads['one_pass']['r2']:.3f}"])
-    return rows
+        task = path.parent.name.partition("-seed")[0]
+        rows.append([task, shown(reads["own"]["return_mean"]), *lost, f"{reads['one_pass']['r2']:.3f}"])
+    rows = [[task, *map("; ".join, list(zip(*of_task))[1:])] for task, of_task in groupby(rows, lambda row: row[0])]
+    head = ["task", "own return", "lost: reads zero", "lost: another state's", "lost: one pass", "its R^2"]
+    return [head, *rows]
+
+
+def markdown(head: list[str], *rows: list[str]) -> str:
+    align = ["---", *["---:"] * (len(head) - 1)]
+    return "\n".join([f"| {' | '.join(head)} |", f"|{'|'.join(align)}|", *(f"| {' | '.join(row)} |" for row in rows)])
 
 
 def fill(page: str) -> str:
     """The page with these tables."""
-    for header, rows in (("| task | PPO: best |", returns()), ("| task | own return |", feedback())):
-        start = page.index(header)
+    for table in (returns(), controls(), feedback()):
+        start = page.index(f"| {table[0][0]} | {table[0][1]} |")
         end = page.index("\n\n", start)
-        head = page[start:end].splitlines()[:2]
-        page = page[:start] + "\n".join([*head, *(f"| {' | '.join(row)} |" for row in rows)]) + page[end:]
+        page = page[:start] + markdown(*table) + page[end:]
     return page
 
 
