@@ -7,11 +7,12 @@ beginning of its first line.
 from itertools import groupby
 
 import pandas as pd
+import report
 from common import ROOT
 from report import Estimate, Spread, shown
 
 RESULTS, TABLES = ROOT / "sweeps" / "results", ROOT / "sweeps" / "results" / "benchmark" / "1M"
-SELECTIONS, METHODS = {"best": "best", "last": "last", "last_10_percent": "last 10 %"}, ("ppo", "refineppo")
+METHODS, SELECTIONS = ("ppo", "refineppo"), ("best", "last", "last_10_percent")  # as in the names of columns
 
 
 def returns() -> list[list[str]]:
@@ -39,7 +40,7 @@ def controls() -> list[list[str]]:
     names = table.difference.str.removesuffix(" - PPO").str.removeprefix("RefinePPO ").str.removesuffix(" average")
     rows = [
         [name, *(estimate(row, f"{selection}_p_higher") for _, row in table.iterrows())]
-        for selection, name in SELECTIONS.items()
+        for selection, name in zip(SELECTIONS, report.SELECTIONS.values())
     ]
     return [["P(higher than PPO)", *names], ["tasks", *table.task.str.split().str[0]], *rows]
 

@@ -43,9 +43,9 @@ def table_commands(text: str) -> list[str]:
 
 
 def commands(block: str) -> list[str]:
-    """Every command, also of those joined by &&."""
-    lines = block.replace("\\\n", " ").replace("&&", "\n").splitlines()
-    return [line.strip() for line in lines if shlex.split(line, comments=True)]
+    """Every command, also of those joined by &&, without comments: they would hide the flags that make it short."""
+    lines = re.sub(r"(^| )#.*", "", block.replace("\\\n", " ").replace("&&", "\n"), flags=re.MULTILINE).splitlines()
+    return [line.strip() for line in lines if line.strip()]
 
 
 def bash(command: str, folder: Path, **env) -> str:
