@@ -42,7 +42,7 @@ def controls() -> list[list[str]]:
         [name, *(estimate(row, f"{selection}_p_higher") for _, row in table.iterrows())]
         for selection, name in zip(SELECTIONS, report.SELECTIONS.values())
     ]
-    return [["P(higher than PPO)", *names], ["tasks", *table.task.str.split().str[0]], *rows]
+    return [["P(higher than PPO)", *names], *rows]
 
 
 def feedback() -> list[list[str]]:
