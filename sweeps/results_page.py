@@ -16,17 +16,29 @@ METHODS, SELECTIONS = ("ppo", "refineppo"), ("best", "last", "last_10_percent") 
 
 
 def returns() -> list[list[str]]:
-    """A row for each task: best, last and last 10 % of PPO and of RefinePPO; then both over all tasks."""
+    """A row for each task: best, last and last 10 % of PPO and of RefinePPO, and the paper's; then over all tasks."""
     columns = [f"{method}_{selection}" for method in METHODS for selection in SELECTIONS]
+    columns += [f"paper_{method}" for method in METHODS]
+    table = pd.read_csv(TABLES / "selection.csv").merge(pd.read_csv(TABLES / "table1.csv"), "left", "task")
     rows = [
-        [row["task"], *(str(Spread(row[f"{column}_mean"], row[f"{column}_std"])) for column in columns)]
-        for _, row in pd.read_csv(TABLES / "selection.csv").iterrows()
+        [row["task"], *(str(Spread(float(row[f"{column}_mean"]), float(row[f"{column}_std"]))) for column in columns)]
+        for _, row in table.iterrows()
     ]
     over_all = pd.read_csv(TABLES / "aggregate.csv")
     iqm = [estimate(row, f"{method}_iqm") for method in METHODS for _, row in over_all.iterrows()]
     wins = [estimate(row, "p_improvement") for _, row in over_all.iterrows()]
-    head = ["task", "PPO: best", "last", "last 10 %", "RefinePPO: best", "last", "last 10 %"]
-    return [head, *rows, ["all: IQM, normalised", *iqm], ["all: RefinePPO wins", "", "", "", *wins]]
+    head = [
+        "task",
+        "PPO: best",
+        "last",
+        "last 10 %",
+        "RefinePPO: best",
+        "last",
+        "last 10 %",
+        "paper, 6M: PPO",
+        "RefinePPO",
+    ]
+    return [head, *rows, ["all: IQM, normalised", *iqm, "", ""], ["all: RefinePPO wins", "", "", "", *wins, "", ""]]
 
 
 def estimate(row: pd.Series, name: str) -> str:
@@ -46,15 +58,18 @@ def controls() -> list[list[str]]:
 
 
 def feedback() -> list[list[str]]:
-    """A row for each task and budget, of several seeds in one: the own return; what is lost, with its standard error;
-    R^2 of the network of one pass."""
+    """A row for each task and budget, of several seeds in one: the own return; what is lost, with its standard error
+    and share of that return; R^2 of the network of one pass."""
     rows = []
     for path in sorted(RESULTS.glob("analysis/*/feedback.csv")):
         reads = {row.pop("reads"): row for row in pd.read_csv(path).to_dict("records")}
-        lost = [reads[x] for x in ("zero", "another_state", "one_pass")]
-        lost = [str(Spread(x["lost_mean"], x["lost_std"] / x["episodes"] ** 0.5)) for x in lost]
-        task = path.parent.name.partition("-seed")[0]
-        rows.append([task, shown(reads["own"]["return_mean"]), *lost, f"{reads['one_pass']['r2']:.3f}"])
+        own, task = reads["own"]["return_mean"], path.parent.name.partition("-seed")[0]
+        lost = [
+            f"{Spread(x['lost_mean'], x['lost_std'] / x['episodes'] ** 0.5)}"
+            + f" ({round(x['lost_mean'] / abs(own) * 100) if own else 0} %)"
+            for x in (reads["zero"], reads["another_state"], reads["one_pass"])
+        ]
+        rows.append([task, shown(own), *lost, f"{reads['one_pass']['r2']:.3f}"])
     rows = [[task, *map("; ".join, list(zip(*of_task))[1:])] for task, of_task in groupby(rows, lambda row: row[0])]
     head = ["task", "own return", "lost: reads zero", "lost: another state's", "lost: one pass", "its R^2"]
     return [head, *rows]
