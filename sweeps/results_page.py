@@ -20,25 +20,17 @@ def returns() -> list[list[str]]:
     columns = [f"{method}_{selection}" for method in METHODS for selection in SELECTIONS]
     columns += [f"paper_{method}" for method in METHODS]
     table = pd.read_csv(TABLES / "selection.csv").merge(pd.read_csv(TABLES / "table1.csv"), "left", "task")
-    rows = [
-        [row["task"], *(str(Spread(float(row[f"{column}_mean"]), float(row[f"{column}_std"]))) for column in columns)]
-        for _, row in table.iterrows()
-    ]
+    rows = [[row["task"], *(spread(row, column) for column in columns)] for _, row in table.iterrows()]
     over_all = pd.read_csv(TABLES / "aggregate.csv")
     iqm = [estimate(row, f"{method}_iqm") for method in METHODS for _, row in over_all.iterrows()]
     wins = [estimate(row, "p_improvement") for _, row in over_all.iterrows()]
-    head = [
-        "task",
-        "PPO: best",
-        "last",
-        "last 10 %",
-        "RefinePPO: best",
-        "last",
-        "last 10 %",
-        "paper, 6M: PPO",
-        "RefinePPO",
-    ]
+    head = ["task", "PPO: best", "last", "last 10 %", "RefinePPO: best", "last", "last 10 %"]
+    head += ["paper, 6M: PPO", "RefinePPO"]
     return [head, *rows, ["all: IQM, normalised", *iqm, "", ""], ["all: RefinePPO wins", "", "", "", *wins, "", ""]]
+
+
+def spread(row: pd.Series, name: str) -> str:
+    return str(Spread(float(row[f"{name}_mean"]), float(row[f"{name}_std"])))  # the paper's are integers
 
 
 def estimate(row: pd.Series, name: str) -> str:
@@ -64,15 +56,18 @@ def feedback() -> list[list[str]]:
     for path in sorted(RESULTS.glob("analysis/*/feedback.csv")):
         reads = {row.pop("reads"): row for row in pd.read_csv(path).to_dict("records")}
         own, task = reads["own"]["return_mean"], path.parent.name.partition("-seed")[0]
-        lost = [
-            f"{Spread(x['lost_mean'], x['lost_std'] / x['episodes'] ** 0.5)}"
-            + f" ({round(x['lost_mean'] / abs(own) * 100) if own else 0} %)"
-            for x in (reads["zero"], reads["another_state"], reads["one_pass"])
-        ]
-        rows.append([task, shown(own), *lost, f"{reads['one_pass']['r2']:.3f}"])
+        losses = [lost(reads[x], own) for x in ("zero", "another_state", "one_pass")]
+        rows.append([task, shown(own), *losses, f"{reads['one_pass']['r2']:.3f}"])
     rows = [[task, *map("; ".join, list(zip(*of_task))[1:])] for task, of_task in groupby(rows, lambda row: row[0])]
     head = ["task", "own return", "lost: reads zero", "lost: another state's", "lost: one pass", "its R^2"]
     return [head, *rows]
+
+
+def lost(row: dict, own: float) -> str:
+    """The loss, its standard error and its share of the own return."""
+    error = row["lost_std"] / row["episodes"] ** 0.5
+    share = row["lost_mean"] / abs(own) if own else 0
+    return f"{Spread(row['lost_mean'], error)} ({round(share * 100)} %)"
 
 
 def markdown(head: list[str], *rows: list[str]) -> str:
